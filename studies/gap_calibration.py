@@ -33,7 +33,7 @@ from psfcore.blind.judged import required_causes
 from psfcore.blind.score import wilson
 from psfcore.build import known_diffraction
 from psfcore.errors import DataError
-from psfcore.gap.diagnose import linear_model_of
+from psfcore.gap.evidence.expected_gap import linear_model_of
 from psfcore.gap.evidence.fields import Field
 from psfcore.gap.evidence.likelihood import TEMPLATE_ERRORS, Weighed
 from psfcore.gap.evidence.measured_noise import measured_noise
@@ -53,8 +53,7 @@ from psfcore.gap.verdict.posterior import (
     probabilities,
     without_idle,
 )
-from psfcore.gap.verdict.refits import Refits
-from psfcore.gap.verdict.settled import settled_posterior
+from psfcore.gap.verdict.refits import Refits, settled_posterior
 from psfcore.gap.view import View
 from psfcore.scatter.inversion import invert
 from psfcore.transit.folder import read_transit
@@ -111,7 +110,7 @@ def posterior_of(folder: Path) -> tuple[Posterior, tuple[float, ...]]:
     view = View(invert(transit))
     model, _ = linear_model_of(view, LIBRARY)
     refits = Refits(view, model)
-    found, _ = settled_posterior(posterior(model, refits.columns), refits.weighed)
+    found = settled_posterior(posterior(model, refits.columns), refits.weighed)
     return found, tuple(refits.departures)
 
 

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from psfcore.errors import DataError
-from psfcore.gap.cautions import caution_of_closure
-from psfcore.gap.diagnose import Diagnosis, diagnose, diagnose_solution
+from psfcore.gap.diagnose import Diagnosis, caution_of_closure, diagnose
 from psfcore.gap.evidence.measured_noise import measured_noise
 from psfcore.gap.library.registry import LIBRARY
 from psfcore.gap.report.report import gap_report
@@ -54,8 +53,8 @@ def check_no_gap(found: Diagnosis) -> None:
     assert found.p_value > 1e-3
 
 
-def test_clean_images_have_no_gap_and_the_report_is_json(solution: Solution) -> None:
-    found = diagnose_solution(solution, noise=None)
+def test_clean_images_have_no_gap_and_the_report_is_json(clean: Transit, solution: Solution) -> None:
+    found = diagnose(clean, solution=solution)
     check_no_gap(found)
     # The set may contain more: these few small images do not exclude a weak effect.
     assert found.judgement.verdict == "none"
@@ -89,7 +88,7 @@ def test_a_dark_offset_is_found_with_its_size_and_taken_out() -> None:
     # A wrong dark level biases the fit of the PSF; with the effect in the model the bias is gone.
     bent, straight = (s.inversion.values["total"] for s in (full.solution, fit.solution))
     assert abs(straight - TRUTH.total) < abs(bent - TRUTH.total) - 0.005
-    plain = diagnose_solution(full.solution, noise=None, library=small_gaps.FEW, refit=False)
+    plain = diagnose(small_gaps.with_offset(), solution=full.solution, library=small_gaps.FEW, refit=False)
     assert plain.corrected == () and plain.judgement.answer == ("dark_offset",)
     assert plain.p_value == full.p_value < 1e-10
     # The limit of the offset is that of the full refit, and above the truth.
@@ -155,8 +154,8 @@ def test_cautions_tell_what_one_pointing_and_few_images_cannot_show(clean: Trans
 def test_the_set_has_the_coverage_that_was_asked_for(clean: Transit, solution: Solution) -> None:
     """The probabilities of the true causes of 39 simulated cases; their logarithms are spread evenly."""
     calibration = Calibration(1.0, tuple(np.geomspace(1e-4, 0.9, 39)), {})
-    found = diagnose_solution(
-        solution, noise=None, library=FEW, refit=False, coverage=0.95, calibration=calibration
+    found = diagnose(
+        clean, solution=solution, library=FEW, refit=False, coverage=0.95, calibration=calibration
     ).judgement
     small, large = (calibration.answer(found.hypotheses, coverage) for coverage in (0.5, 0.95))
     assert found.coverage == 0.95 and found.members == large and len(small) < len(large)

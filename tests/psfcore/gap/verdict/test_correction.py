@@ -19,7 +19,7 @@ from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
 from psfcore.gap.evidence.search import displaced
 from psfcore.gap.verdict import correction
 from psfcore.gap.verdict.correction import Corrected, add_to_model, images_without
-from psfcore.gap.verdict.same_data import with_same_data
+from psfcore.gap.verdict.posterior import with_same_data
 from psfcore.gap.view import View
 from psfcore.scatter.inversion import invert
 from psfcore.scatter.reconstruction import Solution
