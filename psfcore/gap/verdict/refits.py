@@ -26,7 +26,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from psfcore.errors import DataError
 from psfcore.gap.effect import Effect
@@ -40,7 +39,6 @@ from psfcore.gap.verdict.posterior import NONE, Form, Posterior, at_refit, kind_
 from psfcore.gap.view import View, return_unused_memory
 from psfcore.scatter.reconstruction import Progress
 
-VISIBLE_SIGMA = 2.0
 MOST_TRIES = 2
 MOST_REFITS = 3  # for example, an effect alone, a pair that contains it, and a rival
 VISIBLE = 9.0  # an error of the first order is visible if it adds this much to chi2
@@ -114,30 +112,6 @@ class Refits:
             found += [] if fit is None else [fit]
         return tuple(found)
 
-    @property
-    def departures(self) -> list[float]:
-        """The measured template error of each refit: how far the refit differs from the first order.
-
-        It is the rms difference between the residuals of the linear fit and of the refit in the cells, divided by the
-        rms change of the cells by the effect. If the effects change the cells by less than VISIBLE_SIGMA, noise
-        dominates, and the refit is left out.
-        """
-        out = []
-        for form, refit in self.made.items():
-            before = self.model_with(form)
-            if refit.evidence.images != before.evidence.images:
-                continue
-            linear = fit_effects(before, refit.effects, any_sign=True).step
-            left = before.left(linear)
-            real = refit.model.left(refit.model.fit(refit.evidence.of_effects))
-            base = len(before.evidence.base)
-            own = list(linear.columns[base:])
-            change = [disc.jacobian[own].T @ linear.values[base:] for disc in before.discs]
-            size = _rms(change)
-            if size > VISIBLE_SIGMA:
-                out.append(_rms([a - b for a, b in zip(left, real, strict=True)]) / size)
-        return out
-
     def _fit(self, form: Form) -> Corrected | None:
         if form not in self._made:
             model = self.model_with(form)
@@ -197,10 +171,6 @@ def model_with_field(model: LinearModel, columns: FieldColumns, field: Field, na
     sized = with_likely(effect, float(np.clip(size, LIKELY, widest)))
     effects = tuple(sized if one is effect else one for one in evidence.effects)
     return replace(model, evidence=replace(evidence, effects=effects))
-
-
-def _rms(vectors: Sequence[NDArray[np.float64]]) -> float:
-    return float(np.sqrt(np.mean(np.concatenate(vectors) ** 2)))
 
 
 # --- the settled posterior ---------------------------------------------------------------------------------
