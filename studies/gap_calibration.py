@@ -29,10 +29,12 @@ from scipy.optimize import minimize, minimize_scalar
 
 from heliopsf.psfs import LIMITS
 from psfcore.blind.case_set import BlindSet, SetPlan, make_set
-from psfcore.blind.score import required_causes, wilson
+from psfcore.blind.judged import required_causes
+from psfcore.blind.score import wilson
 from psfcore.build import known_diffraction
 from psfcore.errors import DataError
-from psfcore.gap.diagnose import linear_model_of
+from psfcore.gap.evidence.effect_fits import fit_effects
+from psfcore.gap.evidence.expected_gap import linear_model_of
 from psfcore.gap.evidence.fields import Field
 from psfcore.gap.evidence.likelihood import TEMPLATE_ERRORS, Weighed
 from psfcore.gap.evidence.measured_noise import measured_noise
@@ -52,8 +54,7 @@ from psfcore.gap.verdict.posterior import (
     probabilities,
     without_idle,
 )
-from psfcore.gap.verdict.refits import Refits
-from psfcore.gap.verdict.settled import settled_posterior
+from psfcore.gap.verdict.refits import Refits, settled_posterior
 from psfcore.gap.view import View
 from psfcore.scatter.inversion import invert
 from psfcore.transit.folder import read_transit
@@ -62,6 +63,7 @@ from psfcore.whole_files import write_whole
 KINDS = ("clean", "single", "pair", "unknown", "mixed")
 FITTED: tuple[Kind, ...] = ("single", "unknown", "mixed")  # kinds whose prior probabilities are fitted
 TEMPERATURES = (0.5, 10.0)
+VISIBLE_SIGMA = 2.0
 LEAST_SHARE = 1e-5  # a true cause that is less probable counts as if it had this probability
 HOLDS_FOR = (
     "The coverage holds for transits like these: 18 images of 256 px in three pointings, with no effect, with one or two effects of the "
@@ -74,7 +76,7 @@ HOLDS_FOR = (
 class Case:
     """A case of known cause. true: the effects that an answer must contain. log_weights: as in `Posterior`.
 
-    departures: how far each full refit differs from the first order (`Refits.departures`).
+    departures: how far each full refit differs from the first order (`departures_of`).
     """
 
     number: int
@@ -110,8 +112,36 @@ def posterior_of(folder: Path) -> tuple[Posterior, tuple[float, ...]]:
     view = View(invert(transit))
     model, _ = linear_model_of(view, LIBRARY)
     refits = Refits(view, model)
-    found, _ = settled_posterior(posterior(model, refits.columns), refits.weighed)
-    return found, tuple(refits.departures)
+    found = settled_posterior(posterior(model, refits.columns), refits.weighed)
+    return found, departures_of(refits)
+
+
+def departures_of(refits: Refits) -> tuple[float, ...]:
+    """The measured template error of each refit: how far the refit differs from the first order.
+
+    It is the rms difference between the residuals of the linear fit and of the refit in the cells, divided by the
+    rms change of the cells by the effect. If the effects change the cells by less than VISIBLE_SIGMA, noise
+    dominates, and the refit is left out.
+    """
+    out = []
+    for form, refit in refits.made.items():
+        before = refits.model_with(form)
+        if refit.evidence.images != before.evidence.images:
+            continue
+        linear = fit_effects(before, refit.effects, any_sign=True).step
+        left = before.left(linear)
+        real = refit.model.left(refit.model.fit(refit.evidence.of_effects))
+        base = len(before.evidence.base)
+        own = list(linear.columns[base:])
+        change = [disc.jacobian[own].T @ linear.values[base:] for disc in before.discs]
+        size = _rms(change)
+        if size > VISIBLE_SIGMA:
+            out.append(_rms([a - b for a, b in zip(left, real, strict=True)]) / size)
+    return tuple(out)
+
+
+def _rms(vectors: Sequence[NDArray[np.float64]]) -> float:
+    return float(np.sqrt(np.mean(np.concatenate(vectors) ** 2)))
 
 
 def in_calibration(cases: Sequence[Case]) -> list[Case]:

@@ -21,16 +21,15 @@ import numpy as np
 from heliopsf.psfs import LIMITS
 from psfcore.blind.score import wilson
 from psfcore.errors import DataError
-from psfcore.gap.diagnose import linear_model_of
 from psfcore.gap.effect import Effect
+from psfcore.gap.evidence.expected_gap import linear_model_of
 from psfcore.gap.evidence.linear_model import LinearModel
 from psfcore.gap.library.registry import LIBRARY
 from psfcore.gap.verdict.calibration import shipped_calibration
 from psfcore.gap.verdict.correction import hold, images_without
 from psfcore.gap.verdict.limits import ParameterLimits, limits
 from psfcore.gap.verdict.posterior import NONE, posterior, without_idle
-from psfcore.gap.verdict.refits import Refits
-from psfcore.gap.verdict.settled import settled_posterior
+from psfcore.gap.verdict.refits import Refits, settled_posterior
 from psfcore.gap.view import View
 from psfcore.scatter.inversion import invert
 from psfcore.simulate.inputs import diffraction_kernel
@@ -91,7 +90,7 @@ def case_of(number: int, asked: Settings) -> Case:
     view = View(solution)
     model, _ = linear_model_of(view, LIBRARY)
     refits = Refits(view, model)
-    found, _ = settled_posterior(posterior(model, refits.columns), refits.weighed)
+    found = settled_posterior(posterior(model, refits.columns), refits.weighed)
     shares = without_idle(found.probabilities(asked.temperature))
     best = next(iter(shares))
     answer = {names for names, share in shares.items() if share >= asked.threshold} | {best}

@@ -22,7 +22,7 @@ with the smallest chi2. This is the truth with the probability
 For one rival this is Phi(sqrt(lambda) / 2). For M rivals at equal distances it is the forced choice between M + 1
 alternatives, a maximum of Gaussian variables (Green and Swets, Signal Detection Theory and Psychophysics, 1966, chapter
 2). Hypotheses with more effects than the truth are left out: they contain the truth, or are less probable. Hypotheses
-that a right answer may name (`scoring`) are left out too. The bound is the smallest of these values: Eq. (2) for each
+that a right answer may name (`judged`) are left out too. The bound is the smallest of these values: Eq. (2) for each
 hypothesis with fewer effects, and Eq. (3). A right answer need not name every true effect. If Eq. (2) finds such an
 effect beside the others with a probability of one half or more, this effect counts as an effect of the truth, and a
 rival must explain this effect too.
@@ -45,7 +45,6 @@ from scipy.special import log_ndtr, ndtr, ndtri
 Effects = frozenset[str]
 
 LEVEL = 0.05
-SCHEMA = "gap-ideal/1"
 _U = np.linspace(-9.0, 9.0, 721)
 _PHI = np.exp(-0.5 * _U**2) / math.sqrt(2 * math.pi) * (_U[1] - _U[0])
 

@@ -1,11 +1,4 @@
-"""The score of a blind set: whether each report is right, and a table of figures that judge the diagnosis.
-
-**Causes.** The answer of a report is the set of effects that the verdict `attributed` or `tie` names. A report also
-states a set of hypotheses. A hypothesis is a list of causes that act together: effects of the gap library (they are
-"known"), and "unknown" for any other ("withheld") effect; `[]` is no gap. A hypothesis covers the truth if it contains
-every required cause. An effect is required if it alone leaves at least LOWER_LEVEL_PCT in the discs; if no effect leaves
-that much, all are required. The hypothesis may also contain other effects, except for clean data and for a withheld effect
-alone. A set is right and alone if it has only one member, and this member covers the truth and contains no wrong cause.
+"""The score of a blind set: a table of figures that judge the diagnosis, as JSON, as text and as a picture.
 
 **Selections.** "Left" is the residual that the effects leave in the discs after the refit of the PSF. "Noncentrality" and
 "rival" are numbers of the ideal observer (`bounds.Known`): the chi2 of the gap that remains in noise-free images after the
@@ -14,17 +7,9 @@ for which they were computed. For the two effects of a mixed case, the noncentra
 leaves in the means of the discs (`left_alone_chi2`). In a row "/ ideal observer", the number of cases that meet the
 condition is divided by the number expected of the ideal observer, the sum of `bounds.Known.alone`.
 
-**Maps.** The truth of a case with added light contains a map of this light. The distance of its peak from that of the
-report's map is in units of half the width of the field.
+    (p + z^2 / 2n +- z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2 / n)                             Eq. (1)
 
-    true closure = 1 - (sum of (s_i / n_i)^2) / (sum of (e_i / n_i)^2)                                Eq. (1)
-    (p + z^2 / 2n +- z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2 / n)                             Eq. (2)
-
-Eq. (1) is the closure that a perfect model of the true effect would reach on noise-free images. e_i is the residual of
-image i with the effect, after the PSF was refitted. s_i is the residual of the same image without the effect; the
-sampling of the image on pixels causes it. n_i is the noise of the residual. The true closure is below 1, because a
-model of the effect does not remove s_i. The library and the blind set describe the same effect by different formulas; this
-difference counts as an error of the diagnosis. Eq. (2) is the Wilson interval of a fraction p of n cases.
+Eq. (1) is the Wilson interval of a fraction p of n cases.
 """
 
 from __future__ import annotations
@@ -33,34 +18,30 @@ import json
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from itertools import pairwise
+from pathlib import Path
 from statistics import mean, median
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 
-from psfcore.blind.bounds import CLEAN as KNOWN_OF_CLEAN
-from psfcore.blind.bounds import Known, known
 from psfcore.blind.case_set import BlindSet
 from psfcore.blind.cases import CLEAN, FOREIGN, MIXED, PAIR, SINGLE
 from psfcore.blind.effects.registry import KNOWN, UNKNOWN
-from psfcore.blind.picture import score_png
+from psfcore.blind.judged import ATTRIBUTED, INCONCLUSIVE, LOWER_LEVEL_PCT, NO_GAP, NONE, OTHER, Judged
 from psfcore.blind.run_set import IDEAL_SCHEMA, REPORT_SCHEMA, result_in, run_of
+from psfcore.drawing.plots import INK, write_png
 
 SCHEMA = "gap-blind/1"
-LOWER_LEVEL_PCT, LEVEL_PCT, STRONG_PCT = 1.0, 2.0, 10.0
+LEVEL_PCT, STRONG_PCT = 2.0, 10.0
 # A chi2: an effect with this noncentrality is found among eighteen effects with a probability of 0.99.
 SEEN = 30.0
 NEAR = 0.15  # distance of the peak of a map from the true peak, in units of half the field
-LEAST_CLOSURE = 0.1  # if the closure by the true effect is smaller, the ratio of closures has no meaning
 POWER_EDGES_PCT = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, math.inf)
 Z95 = 1.959963984540054
-NONE, ATTRIBUTED, TIE, INCONCLUSIVE = "none", "attributed", "tie", "inconclusive"
-NO_GAP: tuple[str, ...] = ()
-OTHER = "unknown"  # as a verdict, and as a cause in a hypothesis
 KIND_WORDS = {
     CLEAN: "clean",
     SINGLE: "one effect",
@@ -83,260 +64,12 @@ AXES: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("core_blur", "mesh_pitch", "occulter_motion"), ("radius_in_disc", "azimuth_in_disc")),
 }
 
-
-# Withheld effects that are a known effect in another form. A truncation to steps loses half a step on average: a smooth function of
-# the counts, which is a nonlinearity whatever its curve.
-IN_OTHER_FORM = {"faint_rounding": "nonlinearity"}
-
-
-def cause_of(name: str) -> str:
-    """The name of an effect in a hypothesis: effects that are not in the library are "unknown"."""
-    known = IN_OTHER_FORM.get(name, name)
-    return known if known in KNOWN else OTHER
-
-
-def required_causes(truth: Mapping[str, Any]) -> tuple[str, ...]:
-    """The causes that a hypothesis must contain to cover a truth."""
-    effects = truth["effects"]
-    shown = [e for e in effects if e.get("left_alone_pct", LOWER_LEVEL_PCT) >= LOWER_LEVEL_PCT]
-    return tuple(dict.fromkeys(cause_of(effect["name"]) for effect in shown or effects))
-
-
-@dataclass(frozen=True)
-class Judged:
-    """One case: its truth, its report, the wall time of its diagnosis, and what an ideal observer could know (gap-ideal/1)."""
-
-    number: int
-    truth: dict[str, Any]
-    report: dict[str, Any]
-    wall_s: float
-    ideal: dict[str, Any] | None = None
-
-    @property
-    def kind(self) -> str:
-        """The kind of the case: CLEAN, SINGLE, PAIR, FOREIGN or MIXED."""
-        return str(self.truth["kind"])
-
-    @property
-    def true_names(self) -> tuple[str, ...]:
-        """The names of the true effects."""
-        return tuple(effect["name"] for effect in self.truth["effects"])
-
-    @property
-    def true_causes(self) -> set[str]:
-        """The true effects, as a hypothesis names them."""
-        return set(map(cause_of, self.true_names))
-
-    @property
-    def required(self) -> set[str]:
-        """The result of `required_causes`."""
-        return set(required_causes(self.truth))
-
-    @property
-    def left_pct(self) -> float:
-        """The residual that the effects leave in the discs after the refit, percent, rms over images.
-
-        If the truth does not state this residual, the value of the ideal observer is used; NaN if that was not
-        computed.
-        """
-        if self.truth.get("left_after_refit_pct") is not None:
-            return float(self.truth["left_after_refit_pct"])
-        return math.nan if self.ideal is None else float(self.ideal["left_after_refit_pct"])
-
-    @cached_property
-    def known(self) -> Known | None:
-        """What an ideal observer could know about the case; None if it was not computed."""
-        if self.kind == CLEAN:
-            return KNOWN_OF_CLEAN
-        if self.ideal is None:
-            return None
-        in_library = self.kind in (SINGLE, PAIR)
-        required = tuple(self.required) if in_library else self.true_names
-        return known(self.ideal, required, self.true_names, in_library=in_library)
-
-    @property
-    def noncentrality(self) -> float:
-        """The noncentrality of the case (`bounds.Known`), a chi2; NaN if it was not computed."""
-        return math.nan if self.known is None else self.known.noncentrality
-
-    @property
-    def members(self) -> tuple[tuple[str, ...], ...]:
-        """The hypotheses in the set of the report."""
-        return tuple(tuple(member) for member in self.report["set"]["members"])
-
-    @property
-    def verdict(self) -> str:
-        """The verdict of the report, one word."""
-        return str(self.report["verdict"])
-
-    @property
-    def answer(self) -> tuple[str, ...]:
-        """The effects that the verdict `attributed` or `tie` names as the cause; empty for other verdicts."""
-        return tuple(self.report.get("answer", ())) if self.verdict in (ATTRIBUTED, TIE) else ()
-
-    @property
-    def first(self) -> str | None:
-        """The name of the first effect in the report; None if the report has no effects."""
-        return next((effect["name"] for effect in self.report.get("effects", ())), None)
-
-    @property
-    def strongest_axis(self) -> str | None:
-        """The axis along which the gap of the report varies most; None if the report states none."""
-        return (self.report.get("where") or [{}])[0].get("axis")
-
-    @property
-    def unknown(self) -> dict[str, Any]:
-        """What the report states about the most probable field of an unknown cause; empty if it states none."""
-        fields = (self.report.get("unknown") or {}).get("fields") or [{}]
-        return dict(fields[0])
-
-    @property
-    def stages(self) -> set[str]:
-        """The stages of the withheld effects, and "time" if one of them grows or fades; a simulator of a user need not state them."""
-        withheld = [e for e in self.truth["effects"] if cause_of(e["name"]) == OTHER]
-        stages = {str(effect["stage"]) for effect in withheld if "stage" in effect}
-        return stages | ({"time"} if any(effect.get("in_time") for effect in withheld) else set())
-
-    @property
-    def stage_is_right(self) -> bool:
-        """Whether the report states the stage of the withheld effect."""
-        return self.unknown.get("stage") in self.stages
-
-    def closure(self, name: str | None) -> dict[str, Any] | None:
-        """The closure (value and ci90) that the report states for an effect; None if it states no closure."""
-        effects = self.report.get("effects", ())
-        return next((effect.get("closure") for effect in effects if effect["name"] == name), None)
-
-    @cached_property
-    def map(self) -> tuple[float, float] | None:
-        """The distance of the peak of the report's map from the true one, and the correlation of the maps.
-
-        None if the truth or the report has no map.
-        """
-        if "light_map" not in self.truth or "map" not in self.unknown:
-            return None
-        light, stated = self.truth["light_map"], self.unknown["map"]
-        grid, size_px = np.asarray(light["values"]), light["size_px"]
-        at = np.stack(np.meshgrid(stated["x_px"], stated["y_px"]), axis=-1).reshape(-1, 2)
-        x, y = np.clip((at.T + 0.5) / size_px * len(grid), 0, len(grid) - 1).astype(int)
-        true, values = grid[y, x], np.ravel(np.asarray(stated["value"], dtype=np.float64))
-        way = at[np.argmax(np.abs(values))] - at[np.argmax(np.abs(true))]
-        both_vary = true.std() > 0 and values.std() > 0
-        correlation = float(np.corrcoef(true, values)[0, 1]) if both_vary else 0.0
-        return float(np.hypot(*way)) / (size_px / 2), correlation
-
-
-def raises_alarm(case: Judged) -> bool:
-    """Whether the verdict is not `none`, so that the report claims or suspects a gap."""
-    return case.verdict != NONE
-
-
-def contains_truth(case: Judged) -> bool:
-    """Whether the answer names every required effect."""
-    return case.required <= set(case.answer)
-
-
-def covers(case: Judged, hypothesis: tuple[str, ...]) -> bool:
-    """Whether a hypothesis covers the truth of the case."""
-    may_have_more = case.kind not in (CLEAN, FOREIGN)
-    return case.required <= set(hypothesis) and (may_have_more or set(hypothesis) <= case.true_causes)
-
-
-def set_covers_truth(case: Judged) -> bool:
-    """Whether a member of the set covers the truth."""
-    return any(covers(case, member) for member in case.members)
-
-
-def is_right_and_alone(case: Judged) -> bool:
-    """Whether the set has only one member, and this member covers the truth and contains no wrong cause."""
-    (member, *others) = case.members or (NO_GAP, NO_GAP)
-    return not others and covers(case, member) and set(member) <= case.true_causes
-
-
-def verdict_is_right(case: Judged) -> bool:
-    """Whether the verdict states the truth and nothing else.
-
-    It is `none` for clean data, and `unknown` if a withheld effect acts, else `attributed`. The known effects that the
-    report's answer names are true, and are all that are required.
-    """
-    if case.kind == CLEAN or case.verdict not in (ATTRIBUTED, OTHER):
-        return case.kind == CLEAN and case.verdict == NONE
-    said = {*case.report.get("answer", ()), *((OTHER,) if case.verdict == OTHER else ())}
-    return case.required <= said <= case.true_causes
-
-
-def has_only_wrong_effects(case: Judged) -> bool:
-    """Whether every member of the set names effects of the library alone, and none of them is true."""
-    return bool(case.members) and all(
-        member and OTHER not in member and not set(member) & case.true_causes for member in case.members
-    )
-
-
-def says_unknown(case: Judged) -> bool:
-    """Whether a member of the set contains an unknown cause."""
-    return any(OTHER in member for member in case.members)
-
-
-def tells_both(case: Judged) -> bool:
-    """Whether a member of the set contains the known and the unknown cause of a mixed case, and the stage is right."""
-    return case.stage_is_right and any(case.true_causes <= set(member) for member in case.members)
-
-
-def _by_image(truth: Mapping[str, Any]) -> NDArray[np.float64] | None:
-    """e_i / n_i and s_i / n_i of Eq. (1), (2, images); None if they were not measured."""
-    if "refitted" not in truth:
-        return None
-    left, noise = truth["refitted"]["residual_pct"], truth["refitted"]["noise_pct"]
-    both = [(value / noise[n], truth["clean_by_image_pct"][n] / noise[n]) for n, value in left.items()]
-    return np.array(both).reshape(-1, 2).T
-
-
-def shown_chi2(truth: Mapping[str, Any]) -> float | None:
-    """chi2 of the residuals that the effects leave in the means of the discs after the refit; None if they were not measured."""
-    both = _by_image(truth)
-    return None if both is None else float(np.sum((both[0] - both[1]) ** 2))
-
-
-def true_closure(truth: Mapping[str, Any]) -> float | None:
-    """Eq. (1) for a truth; None if the residuals were not measured."""
-    both = _by_image(truth)
-    if both is None or not both[0].any():
-        return None
-    return float(1 - np.sum(both[1] ** 2) / np.sum(both[0] ** 2))
-
-
-def is_shown(case: Judged) -> bool:
-    """Whether the chi2 of the residuals of the disc means is at least SEEN, for a pair also that of each required effect alone."""
-    required = (e for e in case.truth["effects"] if case.kind == PAIR and e["name"] in case.required)
-    chi2 = [float(effect["left_alone_chi2"]) for effect in required if "left_alone_chi2" in effect]
-    return min([*chi2, shown_chi2(case.truth) or 0.0]) >= SEEN
-
-
-def closure_share(case: Judged) -> float | None:
-    """The closure by the first effect divided by the closure by the true effect; 1 if both are the same effect.
-
-    None if one of the closures is missing, or if the closure by the true effect is below LEAST_CLOSURE.
-    """
-    first, true = case.closure(case.first), case.closure(case.true_names[0])
-    if case.first == case.true_names[0]:
-        return 1.0
-    if first is None or true is None or true["value"] < LEAST_CLOSURE:
-        return None
-    return float(first["value"] / true["value"])
-
-
-def interval_holds(case: Judged) -> bool | None:
-    """Whether the ci90 of the closure by the true effect contains the true closure; None if one of them is missing."""
-    closure, true = case.closure(case.true_names[0]), true_closure(case.truth)
-    return None if closure is None or true is None else bool(closure["ci90"][0] <= true <= closure["ci90"][1])
-
-
 Row = dict[str, Any]
 Holds = Callable[[Judged], float | None]  # 1 if a case meets a condition, 0 if not; 0.5 counts as half a case
 
 
 def wilson(hits: float, cases: int, z: float = Z95) -> tuple[float, float]:
-    """Eq. (2) for hits / cases; (0, 1) if there is no case."""
+    """Eq. (1) for hits / cases; (0, 1) if there is no case."""
     if cases == 0:
         return 0.0, 1.0
     p, spread = hits / cases, z**2 / cases
@@ -353,7 +86,7 @@ def row(
     least: float | None = None,
     most: float | None = None,
 ) -> Row:
-    """A row of the table, as JSON. interval: Eq. (2), if the value is a fraction of cases. least, most: the goal."""
+    """A row of the table, as JSON. interval: Eq. (1), if the value is a fraction of cases. least, most: the goal."""
     bounds = [f"{bound:g}" for bound in (least, most) if bound is not None]
     sign = "" if len(bounds) != 1 else "<= " if least is None else ">= "
     met = None
@@ -380,7 +113,7 @@ def share(
 ) -> Row:
     """The row of a fraction: the number of cases that meet a condition, divided by the expected number.
 
-    expected: the probability that an ideal observer meets the condition. The interval is Eq. (2) for the fraction of cases,
+    expected: the probability that an ideal observer meets the condition. The interval is Eq. (1) for the fraction of cases,
     divided by the mean of ``expected``, which is treated as exact.
     """
     possible = math.fsum(expected(case) for case in cases)
@@ -409,18 +142,14 @@ def figures(judged: Sequence[Judged]) -> Iterator[Row]:
     strong = _left(library, LEVEL_PCT)
     single = _of_kind(strong, SINGLE)
     answered = [case for case in single if case.answer]
-    yield share("false alarms on clean data", clean, raises_alarm, most=0.01)
-    # These cases are also false alarms.
-    yield share("inconclusive on clean data", clean, lambda case: case.verdict == INCONCLUSIVE)
-    yield share("answer contains the truth, >= 2 % left", strong, contains_truth, 0.95)
+    yield share("false alarms on clean data", clean, Judged.raises_alarm, most=0.01)
+    yield share("answer contains the truth, >= 2 % left", strong, Judged.contains_truth, 0.95)
     yield share(
         "the same, >= 1 % left, inconclusive = 1/2",
         _left(library, LOWER_LEVEL_PCT),
-        lambda case: 0.5 if case.verdict == INCONCLUSIVE else contains_truth(case),
+        lambda case: 0.5 if case.verdict == INCONCLUSIVE else case.contains_truth(),
         0.8,
     )
-    shown = [case for case in strong if is_shown(case)]
-    yield share("the same, >= 2 % left, shown by the discs", shown, contains_truth)
     yield share("first effect is the true one", single, lambda case: case.first == case.true_names[0], 0.85)
     yield share(
         "one wrong effect named with confidence",
@@ -438,10 +167,10 @@ def figures(judged: Sequence[Judged]) -> Iterator[Row]:
         lambda case: case.verdict in (OTHER, INCONCLUSIVE),
         0.8,
     )
-    shares = [one for one in map(closure_share, answered) if one is not None]
+    shares = [one for one in map(Judged.closure_share, answered) if one is not None]
     yield of_values("closure by the first effect / by the true effect", shares, median, 0.95)
-    stated = [case for case in answered if interval_holds(case) is not None]
-    yield share("90 % interval contains the true closure", stated, interval_holds, 0.85, 0.95)
+    stated = [case for case in answered if case.interval_holds() is not None]
+    yield share("90 % interval contains the true closure", stated, Judged.interval_holds, 0.85, 0.95)
     noticed = [case for case in single if case.verdict != NONE and case.true_names[0] in AXES]
     yield share(
         "strongest axis is right",
@@ -458,9 +187,9 @@ def set_figures(judged: Sequence[Judged]) -> Iterator[Row]:
     clean, foreign = _of_kind(judged, CLEAN), _of_kind(judged, FOREIGN)
     seen = [case for case in judged if case.noncentrality >= SEEN]
     observed = [case for case in judged if case.known is not None]
-    yield share("set covers the truth", judged, set_covers_truth, 0.87, 0.93)
+    yield share("set covers the truth", judged, Judged.set_covers_truth, 0.87, 0.93)
     for kind, words in KIND_WORDS.items():
-        yield share(f"the same, {words}", _of_kind(judged, kind), set_covers_truth, 0.85)
+        yield share(f"the same, {words}", _of_kind(judged, kind), Judged.set_covers_truth, 0.85)
     for figure, some, most in (
         ("mean number of members of the set", judged, 2.2),
         ("the same, noncentrality >= 30", seen, 1.4),
@@ -468,41 +197,45 @@ def set_figures(judged: Sequence[Judged]) -> Iterator[Row]:
         yield of_values(figure, [float(len(case.members)) for case in some], mean, most=most)
     without_clean = [case for case in observed if case.kind != CLEAN]
     for figure, some, right in (
-        ("right and alone / ideal observer", observed, is_right_and_alone),
-        ("the same, without clean data", without_clean, is_right_and_alone),
-        ("right verdict / ideal observer", observed, verdict_is_right),
+        ("right and alone / ideal observer", observed, Judged.is_right_and_alone),
+        ("the same, without clean data", without_clean, Judged.is_right_and_alone),
+        ("right verdict / ideal observer", observed, Judged.verdict_is_right),
     ):
         yield share(figure, some, right, 0.6, expected=lambda case: case.known.alone if case.known else 0.0)
     yield share("clean data: set without []", clean, lambda case: NO_GAP not in case.members, most=0.01)
     yield share(
         "one wrong effect alone in the set",
         judged,
-        lambda case: len(case.members) == 1 and has_only_wrong_effects(case),
+        lambda case: len(case.members) == 1 and case.has_only_wrong_effects(),
         most=0.02,
     )
-    yield share("only wrong effects in the set", judged, has_only_wrong_effects, most=0.015)
+    yield share("only wrong effects in the set", judged, Judged.has_only_wrong_effects, most=0.015)
     yield share(
-        "only wrong effects in the set, not in the library", foreign, has_only_wrong_effects, most=0.02
+        "only wrong effects in the set, not in the library", foreign, Judged.has_only_wrong_effects, most=0.02
     )
     known_seen = _of_kind(seen, SINGLE, PAIR)
-    yield share("known, noncentrality >= 30: named and alone", known_seen, is_right_and_alone, 0.85)
+    yield share("known, noncentrality >= 30: named and alone", known_seen, Judged.is_right_and_alone, 0.85)
     foreign_seen = _of_kind(seen, FOREIGN)
-    yield share("not in the library, noncentrality >= 30: unknown in set", foreign_seen, says_unknown, 0.9)
+    yield share(
+        "not in the library, noncentrality >= 30: unknown in set", foreign_seen, Judged.says_unknown, 0.9
+    )
     staged = [case for case in foreign_seen if case.stages]
     yield share("the same, its stage is right", staged, lambda case: case.stage_is_right, 0.8)
     far = [case for case in foreign if case.known is not None and (case.known.rival or 0.0) >= SEEN]
-    yield share("the same, nearest rival >= 30", far, says_unknown)
+    yield share("the same, nearest rival >= 30", far, Judged.says_unknown)
     mixed = [
         case
         for case in _of_kind(judged, MIXED)
         if case.stages and all(e.get("left_alone_chi2", 0.0) >= SEEN for e in case.truth["effects"])
     ]
-    yield share("known and withheld, each >= 30: both told", mixed, tells_both, 0.6)
+    yield share("known and withheld, each >= 30: both told", mixed, Judged.tells_both, 0.6)
     mapped = [case for case in seen if case.map is not None]
     yield share("map of light: peak within 0.15", mapped, lambda case: (case.map or (9.0,))[0] <= NEAR, 0.9)
     correlations = [case.map[1] for case in mapped if case.map is not None]
     yield of_values("map of light: correlation, median", correlations, median, 0.8)
-    yield share("set covers the truth, >= 10 % left", _left(judged, STRONG_PCT), set_covers_truth, 0.95)
+    yield share(
+        "set covers the truth, >= 10 % left", _left(judged, STRONG_PCT), Judged.set_covers_truth, 0.95
+    )
 
 
 def _of_kind(judged: Sequence[Judged], *kinds: str) -> list[Judged]:
@@ -555,7 +288,7 @@ def _power(judged: Sequence[Judged]) -> list[dict[str, Any]]:
     for low, high in pairwise(POWER_EDGES_PCT):
         here = [case for case in judged if case.kind != CLEAN and low <= case.left_pct < high]
         library = _of_kind(here, SINGLE, PAIR)
-        noticed, named = sum(map(raises_alarm, here)), sum(map(contains_truth, library))
+        noticed, named = sum(map(Judged.raises_alarm, here)), sum(map(Judged.contains_truth, library))
         found.append(
             {
                 "left_after_refit_pct": [low, None if math.isinf(high) else high],
@@ -584,12 +317,11 @@ def _case(case: Judged) -> dict[str, Any]:
         "left_before_refit_pct": case.truth.get("left_before_refit_pct"),
         "left_after_refit_pct": None if math.isnan(case.left_pct) else case.left_pct,
         "clean_left_pct": case.truth.get("clean_left_pct"),
-        "shown_chi2": shown_chi2(case.truth),
         "verdict": case.verdict,
         "answer": list(case.answer),
         "first": case.first,
         "set": [list(member) for member in case.members],
-        "covered": set_covers_truth(case),
+        "covered": case.set_covers_truth(),
         "unknown": {key: case.unknown.get(key) for key in ("stage", "form", "width", "probability")},
         "map": None if case.map is None else dict(zip(("distance", "correlation"), case.map, strict=True)),
         "noncentrality": None if known is None else known.noncentrality,
@@ -645,3 +377,92 @@ def write_score(made: BlindSet, numbers: Sequence[int], not_made: Mapping[int, s
     (made.folder / "score.txt").write_text(text + "\n", "utf-8")
     score_png(found, made.folder / "score.png")
     return text
+
+
+# --- the picture ------------------------------------------------------------------------------------------
+
+
+def score_png(found: Mapping[str, Any], path: str | Path) -> None:
+    """Draw two panels: the truth against the first effect named, and the power with Wilson intervals.
+
+    found: a score (gap-blind/1). path: a PNG file.
+    """
+    figure = Figure(figsize=(17, 9.5), dpi=90, facecolor="white", layout="constrained")
+    title = f"Blind set: {found['judged']} cases judged, {len(found['failures'])} failed"
+    figure.suptitle(title, fontsize=13, color=INK, weight="bold", x=0.01, ha="left")
+    matrix, power = figure.subplots(1, 2, width_ratios=(1.9, 1))
+    _draw_matrix(matrix, found["confusion"])
+    _draw_power(power, found["power"])
+    write_png(figure, path)
+
+
+def _draw_matrix(axes: Axes, confusion: dict[str, dict[str, int]]) -> None:
+    rows, verdicts = list(confusion), (NONE, OTHER, INCONCLUSIVE)
+    said = {name for row in confusion.values() for name in row}
+    columns = [name for name in (*verdicts, *KNOWN) if name in said or name in verdicts or name in rows]
+    columns += sorted(said - set(columns))
+    counts = np.array([[confusion[row].get(column, 0) for column in columns] for row in rows])
+    if not counts.size:
+        axes.text(0.5, 0.5, "no case was judged", ha="center", transform=axes.transAxes)
+        return
+    axes.imshow(counts / counts.sum(axis=1, keepdims=True), cmap="Blues", vmin=0, vmax=1.3, aspect="auto")
+    for (row, column), count in np.ndenumerate(counts):
+        if count:
+            axes.text(column, row, str(count), ha="center", va="center", fontsize=9, color=INK)
+        if columns[column] in _right_columns(rows[row]):
+            corner = (column - 0.5, row - 0.5)
+            frame = Rectangle(corner, 1, 1, fill=False, edgecolor="#c73e2b", linewidth=1.2, clip_on=False)
+            axes.add_patch(frame)
+    axes.set_xticks(range(len(columns)), columns, rotation=60, ha="right", fontsize=9)
+    labels = [f"{name} *" if _is_foreign(name) else name for name in rows]
+    axes.set_yticks(range(len(rows)), labels, fontsize=9)
+    axes.set(
+        xlabel="first effect named, or verdict",
+        ylabel="truth (* not in the library)",
+        title="Number of cases; frames mark correct verdicts",
+    )
+
+
+def _right_columns(truth: str) -> tuple[str, ...]:
+    if truth == CLEAN:
+        return (NONE,)
+    return (OTHER, INCONCLUSIVE) if _is_foreign(truth) else (truth,)
+
+
+def _is_foreign(truth: str) -> bool:
+    """Whether a row is of an effect that is not in the library; a simulator may have effects with any names."""
+    return truth not in (*KNOWN, CLEAN, PAIR, MIXED)
+
+
+def _draw_power(axes: Axes, power: list[dict[str, Any]]) -> None:
+    edges = [one["left_after_refit_pct"] for one in power]
+    labels = [f"> {low:g}" if high is None else f"{low:g} -\n{high:g}" for low, high in edges]
+    at = np.arange(len(labels))
+    for offset, count, hits, interval, colour, name in (
+        (-0.08, "n", "noticed", "noticed_wilson95", "#1b4f91", "noticed (the verdict is not “none”)"),
+        (0.08, "n_known", "contains_truth", "contains_wilson95", "#2b8a6e", "the named effects include the true ones"),
+    ):  # fmt: skip
+        shown = [n for n, row in enumerate(power) if row[count]]
+        share = np.array([power[n][hits] / power[n][count] for n in shown])
+        ends = np.array([power[n][interval] for n in shown]).reshape(-1, 2)
+        errors = np.abs(np.stack([share - ends[:, 0], ends[:, 1] - share])) if shown else None
+        axes.errorbar(at[shown] + offset, share, yerr=errors, fmt="o-", color=colour, capsize=3, label=name)
+        for n, value in zip(shown, share, strict=True):
+            axes.annotate(
+                f"{power[n][hits]}/{power[n][count]}",
+                (n + offset, value),
+                textcoords="offset points",
+                xytext=(-24 if offset < 0 else 6, 6),
+                fontsize=8,
+                color=colour,
+            )
+    axes.set_xticks(at, labels)
+    axes.set(
+        xlabel="residual left in the discs after the refit (%, rms over images)",
+        ylabel="fraction of cases, with 95 % Wilson interval",
+        ylim=(-0.03, 1.08),
+    )
+    axes.legend(frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.03), ncols=2)
+    axes.grid(color="#dddddd", linewidth=0.7)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)

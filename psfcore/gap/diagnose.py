@@ -22,15 +22,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from psfcore.errors import DataError
-from psfcore.gap.cautions import caution_of_closure, cautions_of
 from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.effect_fits import EffectFit, fit_effects, p_value_of_gap
-from psfcore.gap.evidence.evidence import Evidence, gather
-from psfcore.gap.evidence.expected_gap import ExpectedGap, expected_gap
+from psfcore.gap.evidence.evidence import Evidence
+from psfcore.gap.evidence.expected_gap import ExpectedGap, linear_model_of
 from psfcore.gap.evidence.fields import UNKNOWN, Field, FieldColumns, fields_of
-from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
+from psfcore.gap.evidence.linear_model import LinearModel
 from psfcore.gap.evidence.measured_noise import MeasuredNoise, measured_noise
 from psfcore.gap.library.registry import LIBRARY
+from psfcore.gap.library.scene import MOST_POINTINGS
 from psfcore.gap.verdict.calibration import COVERAGE, Calibration, shipped_calibration
 from psfcore.gap.verdict.closure import (
     HeldOut,
@@ -45,10 +45,9 @@ from psfcore.gap.verdict.closure import (
 from psfcore.gap.verdict.correction import Corrected
 from psfcore.gap.verdict.limits import Limits, limits
 from psfcore.gap.verdict.posterior import NONE, Form, posterior
-from psfcore.gap.verdict.refits import Refits, linear_start
-from psfcore.gap.verdict.settled import settled_posterior
+from psfcore.gap.verdict.refits import Refits, linear_start, settled_posterior
 from psfcore.gap.verdict.unknown import UnknownField, bounds, unknown_fields
-from psfcore.gap.verdict.verdict import Judgement, earned, verdict_of
+from psfcore.gap.verdict.verdict import LEAST_IMAGES, Judgement, earned, verdict_of
 from psfcore.gap.verdict.where import Axis, where
 from psfcore.gap.view import View
 from psfcore.psf import Psf
@@ -56,8 +55,6 @@ from psfcore.scatter.inversion import Inverter, solution_of
 from psfcore.scatter.reconstruction import Progress, Solution
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Shape, Vector, shape_named
 from psfcore.transit.transit import Transit
-
-SMALLEST_SCALE, LARGEST_SCALE = 1.0, 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,58 +153,20 @@ def diagnose(
     """
     if not library:
         raise DataError("bad-library", "expected a library with at least one effect; got none: add an effect")
-    (calibration or shipped_calibration()).threshold(coverage)  # refuses a coverage before the long fit
+    calibration = calibration or shipped_calibration()
+    calibration.threshold(coverage)  # refuses a coverage before the long fit
     noise = measured_noise(transit)
     if noise is not None and not noise.agrees:
         transit = replace(transit, noise=noise.noise)
-    made = solution_of(transit, shape, solution, start=start, threads=threads, progress=progress)
-    return diagnose_solution(
-        made,
-        noise=noise,
-        library=library,
-        seed=seed,
-        refit=refit,
-        coverage=coverage,
-        calibration=calibration,
-        progress=progress,
-    )
-
-
-def start_of(psf: Psf) -> tuple[Shape, Vector]:
-    """The shape with which a PSF was fitted, and the fitted coordinates. `diagnose` can start from these coordinates.
-
-    Raises DataError "psf-not-fitted" if the PSF was not fitted to a transit, "unknown-shape" if its shape is not known here.
-    """
-    if psf.fitted is None:
-        raise DataError(
-            "psf-not-fitted",
-            "expected a PSF that was fitted to a transit, because the fit starts from its shape; "
-            f"{psf.name} {psf.version} has no fitted shape: choose another PSF, or start without a PSF",
-        )
-    return shape_named(psf.fitted.shape), np.array(psf.fitted.coordinates, dtype=np.float64)
-
-
-def diagnose_solution(
-    solution: Solution,
-    *,
-    noise: MeasuredNoise | None,
-    library: Sequence[Effect] = LIBRARY,
-    seed: int = 1,
-    refit: bool = True,
-    coverage: float = COVERAGE,
-    calibration: Calibration | None = None,
-    progress: Progress = lambda stage, step, steps: None,
-) -> Diagnosis:
-    """Diagnose an existing fit. noise: the measured noise, or None. The other arguments and the errors are as in `diagnose`."""
-    calibration = calibration or shipped_calibration()
+    solution = solution_of(transit, shape, solution, start=start, threads=threads, progress=progress)
     view = View(solution)
     model, expected = linear_model_of(view, library, seed=seed, progress=progress)
     refits = Refits(view, model, progress)
-    settled, failed = settled_posterior(posterior(model, refits.columns), refits.weighed if refit else None)
+    settled = posterior(model, refits.columns)
+    if refit:
+        settled = settled_posterior(settled, refits.weighed)
     rng = np.random.default_rng(seed)
-    judged = verdict_of(
-        settled, calibration, images=len(model.evidence.discs), coverage=coverage, failed=failed
-    )
+    judged = verdict_of(settled, calibration, images=len(model.evidence.discs), coverage=coverage)
     told = (
         unknown_fields(model, refits.columns, settled)
         if any(UNKNOWN in names for names in judged.members)
@@ -266,27 +225,18 @@ def diagnose_solution(
     )
 
 
-def linear_model_of(
-    view: View,
-    library: Sequence[Effect],
-    *,
-    seed: int = 1,
-    progress: Progress = lambda stage, step, steps: None,
-) -> tuple[LinearModel, ExpectedGap]:
-    """The linear model of a fit with a library of effects, and the expected gap. seed: the seed of the simulation.
+def start_of(psf: Psf) -> tuple[Shape, Vector]:
+    """The shape with which a PSF was fitted, and the fitted coordinates. `diagnose` can start from these coordinates.
 
-    Raises the errors of `expected_gap` and `gather`.
+    Raises DataError "psf-not-fitted" if the PSF was not fitted to a transit, "unknown-shape" if its shape is not known here.
     """
-    evidence = gather(view.solution, library, view=view, progress=progress)
-    expected = expected_gap(view, evidence, seed=seed, floor=FLOOR, progress=progress)
-    model = LinearModel(
-        evidence,
-        FLOOR,
-        disc_scale=float(np.clip(expected.disc_scale, SMALLEST_SCALE, LARGEST_SCALE)),
-        unocculted_scale=float(np.clip(expected.unocculted_scale, SMALLEST_SCALE, LARGEST_SCALE)),
-        scale_error=expected.scale_error,
-    )
-    return model, expected
+    if psf.fitted is None:
+        raise DataError(
+            "psf-not-fitted",
+            "expected a PSF that was fitted to a transit, because the fit starts from its shape; "
+            f"{psf.name} {psf.version} has no fitted shape: choose another PSF, or start without a PSF",
+        )
+    return shape_named(psf.fitted.shape), np.array(psf.fitted.coordinates, dtype=np.float64)
 
 
 def _favoured(judged: Judgement, explained: EffectFit | None, told: Sequence[UnknownField]) -> list[str]:
@@ -405,3 +355,63 @@ def _before_refit(best: EffectFit, rng: np.random.Generator) -> Interval:
 
 def _noise_pct(evidence: Evidence) -> float:
     return float(np.sqrt(np.mean([(100 * d.mean_noise / d.level) ** 2 for d in evidence.discs])))
+
+
+# --- cautions ---------------------------------------------------------------------------------------------
+
+
+def cautions_of(solution: Solution, noise: MeasuredNoise | None, evidence: Evidence) -> tuple[str, ...]:
+    """Sentences on everything in these data that weakens the verdict."""
+    out = []
+    if noise is None:
+        out.append(
+            "The stated noise could not be checked. Either too few consecutive images have the same pointing, gain mode and "
+            "exposure, or their differences do not look like noise."
+        )
+    elif not noise.agrees:
+        out.append(
+            f"The variance of the noise in the images is {noise.ratio:.2f} times the stated variance. The measured noise was used: "
+            f"{noise.noise.photon_gain_dn:.2f} DN per photon, read noise {noise.noise.read_noise_dn:.2f} DN."
+        )
+    left_out = [f"{name}: {why}" for name, why in solution.inversion.left_out.items()]
+    if left_out:
+        out.append(f"{len(left_out)} images were not used. Examples: {'; '.join(left_out[:3])}")
+    infos = [evidence.image_info[disc.index] for disc in evidence.discs]
+    unmatched = [info.file for info in infos if not info.described]
+    if unmatched:
+        out.append(
+            f"In {len(unmatched)} images ({', '.join(unmatched[:3])}{', …' if len(unmatched) > 3 else ''}) the scene around the "
+            "occulter differs from the scene in the neighbouring images, or no neighbouring image shows it. The fitted position of the "
+            "occulter may be wrong in these images, and the wrong position may cause the residuals in their discs."
+        )
+    if len(infos) < LEAST_IMAGES:
+        out.append(
+            f"With only {len(infos)} images, no image can be held out. Closure and the gap on held-out images are therefore missing."
+        )
+    aimed = len({info.pointing for info in evidence.image_info})
+    if aimed > MOST_POINTINGS:
+        out.append(
+            f"Light from outside the field was tested only in the first {MOST_POINTINGS} of the {aimed} pointings."
+        )
+    if aimed == 1:
+        out.append(
+            "All images have the same pointing: effects that differ between pointings cannot be detected, and no pointing can be held out."
+        )
+    if len({info.exposure_s for info in evidence.image_info}) == 1:
+        out.append(
+            "All images have the same exposure time: an error of every readout (in DN) and an error of the rate (in DN/s) look the same."
+        )
+    return tuple(out)
+
+
+def caution_of_closure(label: str, gap_pct: float, error_pct: float) -> tuple[str, ...]:
+    """A sentence if the closure by some effects says little, because their parameters are too uncertain without the held-out images.
+
+    label: the effects. gap_pct: the gap in held-out images, %. error_pct: the error of their prediction, %, rms.
+    """
+    if error_pct <= gap_pct:
+        return ()
+    return (
+        f"The closure by {label} says little: without the held-out images, its parameters are so uncertain that they predict the "
+        f"discs of these images only to {error_pct:.1f} %, and the gap is {gap_pct:.1f} %. More images, or longer exposures, would help.",
+    )

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits
-from psfcore.gap.diagnose import linear_model_of
 from psfcore.gap.effect import Effect
+from psfcore.gap.evidence.expected_gap import linear_model_of
 from psfcore.gap.evidence.linear_model import LinearModel
 from psfcore.gap.library.registry import LIBRARY
 from psfcore.gap.verdict.calibration import shipped_calibration

@@ -155,6 +155,13 @@ class DiscCells:
         return float(self.share @ self.expected)
 
     @property
+    def patterns(self) -> Matrix:
+        """Five patterns in the cells, each with mean zero (5, cells): the radius, two dipoles and two quadrupoles."""
+        r, t = self.radius, self.azimuth
+        out = np.array([r**2, r * np.cos(t), r * np.sin(t), r**2 * np.cos(2 * t), r**2 * np.sin(2 * t)])
+        return np.asarray(out - (out @ self.share)[:, None])
+
+    @property
     def mean_noise(self) -> float:
         """The noise of the mean of the disc, DN/s."""
         return float(np.sqrt(self.share @ self.covariance @ self.share))

@@ -134,13 +134,9 @@ class Evidence:
         """The index, among all images, of each image with a disc."""
         return tuple(disc.index for disc in self.discs)
 
-    def unocculted_equations(self, images: Sequence[int] | None = None) -> UnoccultedEquations:
-        """The normal equations of all columns from the unocculted blocks. images: the images to use; None: all."""
-        return self.all_unocculted if images is None else self.unocculted.equations(range(self.size), images)
-
     @cached_property
     def all_unocculted(self) -> UnoccultedEquations:
-        """The result of `unocculted_equations` for all images."""
+        """The normal equations of all columns from the unocculted blocks of all images."""
         return self.unocculted.equations(range(self.size))
 
     @cached_property

@@ -1,4 +1,4 @@
-"""The expected gap: the residuals of a fit to images that are simulated from the fitted model itself.
+"""The linear model of a fit, and the expected gap: the residuals of a fit to images that are simulated from the fitted model itself.
 
 The simulation takes the mean scene of each pointing and puts the occulter where it was found. It convolves this scene
 with the fitted PSF and adds photon and read noise. The same fit is then made to the simulated images. In their cells,
@@ -11,16 +11,20 @@ to a change of the PSF. Only their residuals are computed again.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from psfcore.gap.evidence.evidence import Evidence, residuals_at
-from psfcore.gap.evidence.linear_model import LinearModel
+from psfcore.gap.effect import Effect
+from psfcore.gap.evidence.evidence import Evidence, gather, residuals_at
+from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
 from psfcore.gap.view import View
 from psfcore.scatter.inversion import invert
 from psfcore.scatter.reconstruction import Progress
 from psfcore.transit.transit import Transit
+
+SMALLEST_SCALE, LARGEST_SCALE = 1.0, 3.0  # of `LinearModel.disc_scale` and `unocculted_scale`
 
 
 @dataclass(frozen=True)
@@ -51,18 +55,31 @@ def simulated(view: View, seed: int) -> Transit:
     return replace(transit, frames=tuple(frames))
 
 
-def expected_gap(
+def linear_model_of(
     view: View,
-    evidence: Evidence,
+    library: Sequence[Effect],
     *,
     seed: int = 1,
-    floor: float,
     progress: Progress = lambda stage, step, steps: None,
-) -> ExpectedGap:
-    """The expected gap from one simulation. view, evidence: of the fit. floor: as in `LinearModel`.
+) -> tuple[LinearModel, ExpectedGap]:
+    """The linear model of a fit with a library of effects, and the expected gap. seed: the seed of the simulation.
 
-    Raises the errors of `psfcore.scatter.inversion.invert`.
+    Raises the errors of `gather` and of `psfcore.scatter.inversion.invert`.
     """
+    evidence = gather(view.solution, library, view=view, progress=progress)
+    expected = _expected_gap(view, evidence, seed, progress)
+    model = LinearModel(
+        evidence,
+        FLOOR,
+        disc_scale=float(np.clip(expected.disc_scale, SMALLEST_SCALE, LARGEST_SCALE)),
+        unocculted_scale=float(np.clip(expected.unocculted_scale, SMALLEST_SCALE, LARGEST_SCALE)),
+        scale_error=expected.scale_error,
+    )
+    return model, expected
+
+
+def _expected_gap(view: View, evidence: Evidence, seed: int, progress: Progress) -> ExpectedGap:
+    """The expected gap from one simulation. view, evidence: of the fit."""
     solution = view.solution
 
     def say(stage: str, step: int, steps: int) -> None:
@@ -76,7 +93,7 @@ def expected_gap(
         threads=solution.threads,
         progress=say,
     )
-    model = LinearModel(residuals_at(View(again), evidence, progress=say), floor)
+    model = LinearModel(residuals_at(View(again), evidence, progress=say), FLOOR)
     left = model.left(model.base)
     cells = max(sum(one.size for one in left) - len(model.base.columns), 1)
     unocculted = model.evidence.all_unocculted

@@ -14,7 +14,7 @@ which are much smaller than a bump.
 | kernel | optics | the scene convolved with b(log r) times 1, cos a, sin a, cos 2a, sin 2a |
 | kernel_over_field | optics | x or y times the scene convolved with b(log r) |
 | kernel_in_time | optics | the scene convolved with b(log r), times b(time) |
-| disc_shape | optics | the patterns of `patterns.in_disc`, the same in every disc |
+| disc_shape | optics | the patterns of `DiscCells.patterns`, the same in every disc |
 | light | detector | L b(x) |
 | dark | detector | L b(x) T / t_n |
 | gain | detector | E_n(x) b(x) |
@@ -44,7 +44,6 @@ from psfcore.gap.effect import Change, Effect, EffectParameter, Stage
 from psfcore.gap.evidence.cells import DiscCells
 from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.likelihood import Directions
-from psfcore.gap.evidence.patterns import in_disc
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -284,7 +283,8 @@ class FieldColumns:
             to_shape = np.asarray(np.kron(np.eye(sides), of_rings), dtype=np.float64)
             return _shape(field, ("radius_px",), at, to_shape, coefficients, covariance, "1/octave")
         if field.stage == "time":
-            now = bumps(self._times, self._width(field))
+            assert field.width is not None
+            now = bumps(self._times, field.width)
             to_shape = np.zeros((len(infos), coefficients.size))
             to_shape[:, ::3] = size * now.T  # the part that is the same at all places
             seconds = np.array([info.time_s for info in infos])
@@ -336,7 +336,7 @@ class FieldColumns:
         cells = max(disc.residual.size for disc in self._discs)
         patterns = np.zeros((len(self._discs), 6, cells))
         for k, disc in enumerate(self._discs):
-            own = np.vstack([np.ones(disc.residual.size), in_disc(disc)])
+            own = np.vstack([np.ones(disc.residual.size), disc.patterns])
             patterns[k, :, : disc.residual.size] = own * disc.mean_expected
         whole, shapes = patterns[:, 0], patterns[:, 1:]
         each = np.eye(len(self._discs))
@@ -359,11 +359,6 @@ class FieldColumns:
             in_discs.append(np.zeros((count, *whole.shape)) if discs is None else discs)
             in_blocks.append(np.zeros((count, *levels)) if blocks is None else blocks)
         return Directions(np.moveaxis(np.concatenate(in_discs), 0, -1), np.concatenate(in_blocks), LIKELY)
-
-    @staticmethod
-    def _width(field: Field) -> float:
-        assert field.width is not None
-        return field.width
 
     @cached_property
     def _outside(self) -> Planes:

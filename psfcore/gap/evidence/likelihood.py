@@ -94,7 +94,7 @@ class Weighed:
     of the PSF. values: their best values.
     visible_error: the chi2 that a relative error USUAL_ERROR of the template would add in all data, and the curvature of the
     PSF in the discs (CURVATURE). Only the part of the template that was not subtracted counts, and only the remaining step of the
-    PSF. If it is above `settled.VISIBLE`, the first order is not accurate enough.
+    PSF. If it is above `refits.VISIBLE`, the first order is not accurate enough.
     """
 
     log_evidence: float

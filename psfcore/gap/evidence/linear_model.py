@@ -36,7 +36,6 @@ from numpy.typing import NDArray
 
 from psfcore.gap.evidence.cells import DiscCells, whitening
 from psfcore.gap.evidence.evidence import Evidence
-from psfcore.gap.evidence.patterns import means, patterns
 from psfcore.least_squares import scaled_inverse
 
 Vector = NDArray[np.float64]
@@ -117,21 +116,13 @@ class LinearModel:
             if images is None or disc.index in images:
                 normal += disc.jacobian @ disc.jacobian.T
                 score += disc.jacobian @ disc.residual
-        unocculted = self.evidence.unocculted_equations(images)
+        unocculted = self.evidence.all_unocculted
+        if images is not None:
+            unocculted = self.evidence.unocculted.equations(range(size), images)
         return (
             normal + unocculted.normal / self.unocculted_scale,
             score + unocculted.score / self.unocculted_scale,
         )
-
-    @cached_property
-    def patterns(self) -> tuple[Matrix, ...]:
-        """The result of `patterns.patterns` for the evidence."""
-        return patterns(self.evidence)
-
-    @cached_property
-    def means(self) -> tuple[Matrix, ...]:
-        """The result of `patterns.means` for the evidence."""
-        return means(self.evidence)
 
     def fit(self, columns: Sequence[int], equations: tuple[Matrix, Vector] | None = None) -> Step:
         """Fit the coordinates of the PSF and these columns. equations: a result of `equations` (None: for all images)."""

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from psfcore.gap.diagnose import Diagnosis
-from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.effect_fits import left_chi2
 from psfcore.gap.evidence.fields import UNKNOWN as UNKNOWN_NAME
 from psfcore.gap.evidence.fields import Field, FieldShape
@@ -176,11 +175,6 @@ def _values(inversion: Inversion, covariance: NDArray[np.float64]) -> dict[str, 
     }
 
 
-def _by_name(found: Diagnosis, names: Names) -> list[Effect]:
-    effects = {effect.name: effect for effect in found.evidence.effects}
-    return [effects[name] for name in names]
-
-
 def _fit(found: Diagnosis, form: Form) -> dict[str, Any]:
     """The fit of one or several effects, with the parameters of their full refit if there is one."""
     fit, shrinking, judged = found.fits[form], found.shrinking[form], found.judgement
@@ -247,8 +241,8 @@ def would_separate(found: Diagnosis) -> str:
     open_effects: Names = judged.tied
     if judged.verdict == "inconclusive":
         open_effects = tuple(dict.fromkeys(name for names in judged.named for name in names))
-    known = known_effects(open_effects)
-    return "; or ".join(dict.fromkeys(effect.settled_by for effect in _by_name(found, known)))
+    settled_by = {effect.name: effect.settled_by for effect in found.evidence.effects}
+    return "; or ".join(dict.fromkeys(settled_by[name] for name in known_effects(open_effects)))
 
 
 def sentence(found: Diagnosis) -> str:
@@ -283,17 +277,12 @@ def sentence(found: Diagnosis) -> str:
             f"{would_separate(found)}."
         )
     if judged.verdict == "inconclusive":
+        observation = would_separate(found)
         return (
             f"{lead if NONE not in judged.members else 'There may be a gap.'} These data do not decide its cause: "
-            f"{_listed(judged.members, judged)}.{_next_step(found)}"
+            f"{_listed(judged.members, judged)}.{observation and f' To decide, take {observation}.'}"
         )
     return f"{lead} {_explained(found)}.{_not_excluded(judged)}"
-
-
-def _next_step(found: Diagnosis) -> str:
-    """A sentence that names the observation that would decide an inconclusive verdict; empty if none is known."""
-    observation = would_separate(found)
-    return f" To decide, take {observation}." if observation else ""
 
 
 def _unknown_words(found: Diagnosis) -> str:

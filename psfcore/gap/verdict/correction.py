@@ -114,7 +114,8 @@ def add_to_model(
     view = view or View(solution)
     held = [_acting(hold(effect, view), found, len(effects)) for effect in effects]
     wanted = np.array([value for value, _, _ in found.values.values()])
-    in_images = _in_images(held, view)
+    # For each change of the effects, in order: whether the discs show the change.
+    in_images = np.array([change.disc for effect in held for change in effect.changes(view)], dtype=np.bool_)
     base = len(model.evidence.base)
     here, at, theta = view, solution.inversion.coordinates, np.zeros(wanted.size)
     move = found.step.values[:base]
@@ -136,7 +137,8 @@ def add_to_model(
             break  # the step was too long: the fit failed, or the images no longer constrain the effect
         wanted, move = seen.theta, seen.left.step.values[:base]
         # A parameter that must be positive is dropped if its fitted value is not positive.
-        acts = ~(_positive(held) & (wanted <= 0))
+        positive = np.array([parameter.positive for effect in held for parameter in effect.parameters])
+        acts = ~(positive & (wanted <= 0))
         if not acts.all() and rounds < ROUNDS:
             held = _those_that_act(held, acts)
             theta, wanted, in_images = theta[acts], wanted[acts], in_images[acts]
@@ -282,17 +284,6 @@ def _fit_remaining(
     found -= model.pull_of_prior(left.step, out_already)[base:]
     # For a subtracted parameter the fit gives only the remainder; for the other parameters it gives the full value.
     return _Remaining(model, left, np.where(in_images, out + found, found))
-
-
-def _in_images(effects: Sequence[Effect], view: View) -> NDArray[np.bool_]:
-    """For each change of the effects, in order: whether the discs show the change."""
-    return np.array([change.disc for effect in effects for change in effect.changes(view)], dtype=np.bool_)
-
-
-def _positive(effects: Sequence[Effect]) -> NDArray[np.bool_]:
-    return np.array(
-        [parameter.positive for effect in effects for parameter in effect.parameters], dtype=np.bool_
-    )
 
 
 def _those_that_act(effects: Sequence[Effect], acts: NDArray[np.bool_]) -> list[Effect]:

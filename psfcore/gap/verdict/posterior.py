@@ -37,7 +37,6 @@ from psfcore.gap.evidence.fields import LIKELY, Field, FieldColumns, fields_of, 
 from psfcore.gap.evidence.fields import UNKNOWN as UNKNOWN_NAME
 from psfcore.gap.evidence.likelihood import Likelihood, Weighed
 from psfcore.gap.evidence.linear_model import LinearModel
-from psfcore.gap.verdict.same_data import with_same_data
 
 Vector = NDArray[np.float64]
 Names = tuple[str, ...]
@@ -290,6 +289,51 @@ def at_refit(
         found |= of_pairs | _triples(likelihood, evidence, of_pairs, order, taken)
         found |= _with_fields(likelihood, evidence, FieldColumns(evidence, columns), [form], (), taken)
     return found, model
+
+
+def with_same_data(
+    before: Evidence, after: Evidence, taken: Mapping[str, Sequence[float]], moved: Vector
+) -> Evidence:
+    """The evidence of a refit (`after`) with the discs and the blocks of the evidence `before` it, minus the change by the effects.
+
+    All hypotheses must explain the same data. A refit can lose discs, for example if an effect that is too strong was subtracted from a
+    faint image: the lost discs are taken from before the refit, and respond to PSF and effects linearly. Discs that only the refit can
+    use are left out. The change by some effects, for example a halo, is computed from each image and contains a part of its noise; if it
+    is subtracted from the images, their blocks have less noise, and this would wrongly count in favour of the effect. taken, moved: as in
+    `at_refit`.
+    """
+    # For each parameter of the effects: its column at the refit, its column before, and the amount that was subtracted.
+    of_effects: list[tuple[int, int, float]] = []
+    for effect in after.effects:
+        columns = before.columns_of(effect.name)
+        own = [p.name for p in effect.parameters]
+        values = taken.get(effect.name, (0.0,) * len(own))
+        of_effects += (
+            (column, columns[name], value)
+            for name, column, value in zip(own, after.columns[effect.name], values, strict=False)
+        )
+    blocks = before.unocculted
+    errors, levels = np.zeros((after.size, *blocks.levels.shape)), blocks.levels.copy()
+    for column, source, amount in of_effects:
+        errors[column] = blocks.errors[source]
+        levels -= amount * errors[column]
+    discs = [disc for disc in after.discs if disc.index in before.images]
+    for disc in before.discs:
+        if disc.index in after.images:
+            continue
+        jacobian, residual = np.zeros((after.size, disc.residual.size)), disc.residual.copy()
+        for column, source, amount in (
+            *zip(after.base, before.base, moved.tolist(), strict=True),
+            *of_effects,
+        ):
+            jacobian[column] = disc.jacobian[source]
+            residual -= amount * jacobian[column]
+        discs.append(replace(disc, jacobian=jacobian, residual=residual))
+    return replace(
+        after,
+        discs=tuple(sorted(discs, key=lambda disc: disc.index)),
+        unocculted=replace(blocks, errors=errors, levels=levels),
+    )
 
 
 def weigh(

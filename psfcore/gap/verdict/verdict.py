@@ -47,7 +47,6 @@ class Judgement:
     decide the verdict. coverage: the coverage of the answer set.
     hypotheses: the probability of each hypothesis, the most probable first, after `posterior.without_idle`. effects: the
     probability that each effect acts, alone or with another; also of "none" and "unknown". posterior: the forms of the hypotheses.
-    failed: the hypotheses whose full refit failed.
     """
 
     verdict: Verdict
@@ -58,7 +57,6 @@ class Judgement:
     hypotheses: Mapping[Names, float]
     effects: Mapping[str, float]
     posterior: Posterior
-    failed: tuple[Names, ...] = ()
 
     @property
     def named(self) -> tuple[Names, ...]:
@@ -98,7 +96,6 @@ def verdict_of(
     *,
     images: int,
     coverage: float = COVERAGE,
-    failed: tuple[Names, ...] = (),
 ) -> Judgement:
     """The verdict of a posterior. images: the number of images with a disc. Raises DataError "bad-coverage"."""
     raw = found.probabilities(calibration.temperature)
@@ -125,7 +122,6 @@ def verdict_of(
         hypotheses=hypotheses,
         effects=of_effects(raw),
         posterior=found,
-        failed=failed,
     )
 
 

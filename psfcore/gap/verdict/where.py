@@ -26,7 +26,6 @@ from scipy.special import chdtrc
 from psfcore.gap.evidence.cells import DiscCells
 from psfcore.gap.evidence.evidence import Evidence, ImageInfo
 from psfcore.gap.evidence.linear_model import LinearModel, Step
-from psfcore.gap.evidence.patterns import in_disc
 
 Matrix = NDArray[np.float64]
 Vector = NDArray[np.float64]
@@ -131,7 +130,7 @@ def _designs(evidence: Evidence) -> dict[str, list[Matrix]]:
         columns = _curve(values) if name not in ("pointing", "gain_mode") else _kinds(values)
         if columns is not None:
             out[name] = [column[:, None] * one for column, one in zip(columns.T, level, strict=True)]
-    inside = [in_disc(disc) for disc in evidence.discs]
+    inside = [disc.patterns for disc in evidence.discs]
     out["radius_in_disc"] = [p[:1] * one for p, one in zip(inside, level, strict=True)]
     out["azimuth_in_disc"] = [p[1:] * one for p, one in zip(inside, level, strict=True)]
     return out

@@ -12,21 +12,8 @@ import pytest
 from matplotlib.image import imread
 
 from psfcore.blind.bounds import LEVEL
-from psfcore.blind.picture import score_png
-from psfcore.blind.score import (
-    Judged,
-    covers,
-    is_right_and_alone,
-    required_causes,
-    score,
-    set_figures,
-    share,
-    shown_chi2,
-    table,
-    true_closure,
-    verdict_is_right,
-    wilson,
-)
+from psfcore.blind.judged import Judged, required_causes, true_closure
+from psfcore.blind.score import score, score_png, set_figures, share, table, wilson
 
 
 def truth(kind: str, *names: str, left: float = 0.0, **more: Any) -> dict[str, Any]:
@@ -73,15 +60,11 @@ CASES = [
     (truth("unknown", "glow", left=0.3), report("none")),
 ]
 JUDGED = [Judged(n, true, said, 10.0 + n) for n, (true, said) in enumerate(CASES)]
-BY_DISCS = "the same, >= 2 % left, shown by the discs"
 # Figure: cases, value, whether its goal is met.
 FIGURES = {
     "false alarms on clean data": (4, 2 / 4, False),
-    "inconclusive on clean data": (4, 1 / 4, None),
     "answer contains the truth, >= 2 % left": (4, 3 / 4, False),
     "the same, >= 1 % left, inconclusive = 1/2": (5, 3.5 / 5, False),
-    # Two means of chi2 3^2 + 3^2 = 18 are below 30: none of these cases counts.
-    BY_DISCS: (0, None, None),
     "first effect is the true one": (3, 2 / 3, False),
     "one wrong effect named with confidence": (13, 3 / 13, False),
     "mean number of named effects": (4, (1 + 1 + 2 + 2) / 4, True),
@@ -117,33 +100,14 @@ def test_every_figure_of_the_answers_equals_the_one_computed_by_hand() -> None:
     assert true_closure(truth("clean")) is None
 
 
-def test_what_the_discs_show_is_what_exceeds_their_noise() -> None:
-    shown = MEASURED | {"refitted": {"residual_pct": {"0": 3.0, "1": 4.0}, "noise_pct": {"0": 0.5, "1": 1.0}}}
-    assert shown_chi2(shown) == pytest.approx(36 + 9)
-    assert shown_chi2({}) is None
-    case = Judged(0, truth("single", "ghost", left=3.0, **shown), report("attributed", "ghost"), 1.0)
-    row = score([case])["rows"][4]
-    assert (row["figure"], row["n"], row["value"]) == (BY_DISCS, 1, 1.0)
-
-
 def test_of_a_pair_only_the_effects_that_show_must_be_named() -> None:
     said = report("attributed", "ghost")
     pair = truth("pair", "ghost", "scene_evolution", left=4.0)
     pair["effects"][0]["left_alone_pct"], pair["effects"][1]["left_alone_pct"] = 4.0, 0.1
-    contains = score([Judged(0, pair, said, 1.0)])["rows"][2]
+    contains = score([Judged(0, pair, said, 1.0)])["rows"][1]
     assert (contains["n"], contains["value"]) == (1, 1.0)
     pair["effects"][1]["left_alone_pct"] = 1.2
-    assert score([Judged(0, pair, said, 1.0)])["rows"][2]["value"] == 0.0
-    # A pair is shown by the discs if each required effect alone is.
-    shown = MEASURED | {"refitted": {"residual_pct": {"0": 3.0, "1": 4.0}, "noise_pct": {"0": 0.5, "1": 0.5}}}
-    pair = truth("pair", "ghost", "scene_evolution", left=4.0, **shown)
-    strong, weak = pair["effects"]
-    strong["left_alone_chi2"] = 90.0
-    for more, cases in (({"left_alone_chi2": 29.0}, 0), ({"left_alone_chi2": 31.0}, 1)):
-        weak |= more
-        assert score([Judged(0, pair, said, 1.0)])["rows"][4]["n"] == cases, more
-    weak |= {"left_alone_chi2": 29.0, "left_alone_pct": 0.5}  # too weak: it need not be named
-    assert score([Judged(0, pair, said, 1.0)])["rows"][4]["n"] == 1
+    assert score([Judged(0, pair, said, 1.0)])["rows"][1]["value"] == 0.0
 
 
 def test_confusion_power_and_table_count_every_case_once() -> None:
@@ -294,7 +258,7 @@ def test_what_reports_tell_of_an_unknown_cause() -> None:
     agrees = np.corrcoef([0, 1, 2, 9], [9, 2, 1, 0])[0, 1]
     assert rows["map of light: correlation, median"]["value"] == pytest.approx((1 + agrees) / 2)
     assert cases[1].map == pytest.approx((np.hypot(10, 10) / 10, agrees))
-    assert [is_right_and_alone(case) for case in cases] == [
+    assert [case.is_right_and_alone() for case in cases] == [
         True,
         False,
         False,
@@ -333,23 +297,23 @@ def test_what_is_right_is_compared_with_what_could_be_known() -> None:
     mean = math.fsum(alone[3:]) / 7
     assert rows[COMPARED[1]]["wilson95"] == pytest.approx((low / mean, high / mean))
     # Nothing is compared where nothing could be known.
-    row = share("nothing", SETS[:1], is_right_and_alone, expected=lambda one: 0.0)
+    row = share("nothing", SETS[:1], Judged.is_right_and_alone, expected=lambda one: 0.0)
     assert (row["n"], row["value"], row["wilson95"]) == (1, None, None)
 
 
 def test_a_pair_whose_second_effect_is_not_seen_is_covered_by_the_first() -> None:
     pair = with_set("pair", ["ghost", "core_blur"], [["ghost"]], rival=400.0)
-    assert not covers(pair, ("ghost",))
+    assert not pair.covers(("ghost",))
     for effect, left in zip(pair.truth["effects"], (4.0, 0.9), strict=True):
         effect["left_alone_pct"] = left
-    assert covers(pair, ("ghost",)) and is_right_and_alone(pair)
-    assert covers(pair, ("ghost", "core_blur"))
-    assert not covers(pair, ("core_blur",))
+    assert pair.covers(("ghost",)) and pair.is_right_and_alone()
+    assert pair.covers(("ghost", "core_blur"))
+    assert not pair.covers(("core_blur",))
     pair.truth["effects"][0]["left_alone_pct"] = 0.9  # nothing is seen: both are required
-    assert not covers(pair, ("ghost",))
+    assert not pair.covers(("ghost",))
     # Further effects cover the truth, but are not right.
     extra = with_set("single", ["ghost"], [["ghost", "persistence"]])
-    assert covers(extra, ("ghost", "persistence")) and not is_right_and_alone(extra)
+    assert extra.covers(("ghost", "persistence")) and not extra.is_right_and_alone()
 
 
 def test_the_score_tells_the_set_and_what_could_be_known() -> None:
@@ -389,4 +353,4 @@ def test_a_verdict_is_right_if_it_states_the_truth_and_nothing_else() -> None:
     for kind, names, verdict, answer, right in verdicts:
         case = with_set(kind, names, [[]])
         case.report.update(verdict=verdict, answer=answer)
-        assert verdict_is_right(case) is right, (kind, verdict, answer)
+        assert case.verdict_is_right() is right, (kind, verdict, answer)

@@ -12,7 +12,8 @@ import pytest
 
 from psfcore.blind.case_set import make_set
 from psfcore.blind.cases import SetPlan
-from psfcore.blind.score import Judged, score
+from psfcore.blind.judged import Judged
+from psfcore.blind.score import score
 from psfcore.blind.simulator import checked_truth, simulator_of, source_sha256
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from psfcore.errors import DataError
-from psfcore.gap.cautions import caution_of_closure
-from psfcore.gap.diagnose import Diagnosis, diagnose, diagnose_solution
+from psfcore.gap.diagnose import Diagnosis, caution_of_closure, diagnose
 from psfcore.gap.evidence.measured_noise import measured_noise
 from psfcore.gap.library.registry import LIBRARY
 from psfcore.gap.report.report import gap_report
@@ -21,15 +20,12 @@ from psfcore.gap.verdict import where
 from psfcore.gap.verdict.calibration import Calibration
 from psfcore.gap.verdict.posterior import NONE, UNKNOWN, Form
 from psfcore.noise import Noise
-from psfcore.scatter.inversion import invert
-from psfcore.scatter.reconstruction import Solution
 from psfcore.transit.transit import Transit
 from tests.psfcore.gap import small_gaps, small_transits
 from tests.psfcore.gap.small_gaps import changed
 from tests.transit_files import TRUTH
 
-# Without those that search for a position or a form, and without those of many parameters: they take most of the time.
-QUICK = tuple(effect for effect in LIBRARY if effect.held is None and len(effect.parameters) < 4)
+# Without those that search for a position or a form.
 FEW = tuple(effect for effect in small_gaps.FEW if effect.held is None)
 
 
@@ -43,19 +39,14 @@ def clean() -> Transit:
     return small_transits.clean(12)
 
 
-@pytest.fixture(scope="module")
-def solution(clean: Transit) -> Solution:
-    return invert(clean)
-
-
 def check_no_gap(found: Diagnosis) -> None:
     """No gap is the most probable hypothesis, and no effect is named."""
     assert found.judgement.members[0] == NONE and found.judgement.answer == ()
     assert found.p_value > 1e-3
 
 
-def test_clean_images_have_no_gap_and_the_report_is_json(solution: Solution) -> None:
-    found = diagnose_solution(solution, noise=None)
+def test_clean_images_have_no_gap_and_the_report_is_json(clean: Transit) -> None:
+    found = diagnose(clean, solution=small_transits.fit(clean))
     check_no_gap(found)
     # The set may contain more: these few small images do not exclude a weak effect.
     assert found.judgement.verdict == "none"
@@ -69,9 +60,7 @@ def test_clean_images_have_no_gap_and_the_report_is_json(solution: Solution) -> 
 
 def test_a_read_pattern_is_not_attributed_to_an_effect(clean: Transit) -> None:
     stripes = 20 * np.sin(2 * np.pi * np.arange(clean.shape[1]) / 45) * np.ones((clean.shape[0], 1))
-    found = diagnose(
-        changed(clean, lambda n, f: f.pixels + stripes / f.exposure_s), library=QUICK, refit=False
-    )
+    found = diagnose(changed(clean, lambda n, f: f.pixels + stripes / f.exposure_s), library=FEW, refit=False)
     assert UNKNOWN in found.judgement.members
 
 
@@ -89,7 +78,7 @@ def test_a_dark_offset_is_found_with_its_size_and_taken_out() -> None:
     # A wrong dark level biases the fit of the PSF; with the effect in the model the bias is gone.
     bent, straight = (s.inversion.values["total"] for s in (full.solution, fit.solution))
     assert abs(straight - TRUTH.total) < abs(bent - TRUTH.total) - 0.005
-    plain = diagnose_solution(full.solution, noise=None, library=small_gaps.FEW, refit=False)
+    plain = diagnose(small_gaps.with_offset(), solution=full.solution, library=small_gaps.FEW, refit=False)
     assert plain.corrected == () and plain.judgement.answer == ("dark_offset",)
     assert plain.p_value == full.p_value < 1e-10
     # The limit of the offset is that of the full refit, and above the truth.
@@ -119,10 +108,17 @@ def test_light_lost_by_clipping_is_attributed_to_saturation_fill(clean: Transit)
 
 
 def test_wrong_noise_figures_are_noticed_and_are_not_a_gap(clean: Transit) -> None:
-    wrong = Noise(clean.noise.photon_gain_dn * 2.0, clean.noise.read_noise_dn * 2.0)
-    found = diagnose(replace(clean, noise=wrong), library=FEW, refit=False)
+    """The set has the coverage that was asked for, by the calibration of 39 cases."""
+    wrong = replace(clean, noise=Noise(clean.noise.photon_gain_dn * 2.0, clean.noise.read_noise_dn * 2.0))
+    calibration = Calibration(1.0, tuple(np.geomspace(1e-4, 0.9, 39)), {})
+    found = diagnose(wrong, library=FEW, refit=False, coverage=0.95, calibration=calibration)
     check_no_gap(found)
     assert any("times the stated variance" in caution for caution in found.cautions)
+    assert found.judgement.members == calibration.answer(found.judgement.hypotheses, 0.95)
+    for library, coverage, code in ((FEW, 0.98, "bad-coverage"), ((), 0.95, "bad-library")):
+        with pytest.raises(DataError) as refusal:
+            diagnose(clean, library=library, coverage=coverage, calibration=calibration)
+        assert refusal.value.code == code
     # The noise of the images is measured.
     noise = measured_noise(clean)
     assert noise is not None and noise.agrees
@@ -150,19 +146,3 @@ def test_cautions_tell_what_one_pointing_and_few_images_cannot_show(clean: Trans
     (caution,) = caution_of_closure("ghost", gap_pct=6.4, error_pct=6.8)
     assert "closure by ghost" in caution and "6.8 %" in caution and "6.4 %" in caution
     assert caution_of_closure("ghost", gap_pct=6.4, error_pct=2.0) == ()
-
-
-def test_the_set_has_the_coverage_that_was_asked_for(clean: Transit, solution: Solution) -> None:
-    """The probabilities of the true causes of 39 simulated cases; their logarithms are spread evenly."""
-    calibration = Calibration(1.0, tuple(np.geomspace(1e-4, 0.9, 39)), {})
-    found = diagnose_solution(
-        solution, noise=None, library=FEW, refit=False, coverage=0.95, calibration=calibration
-    ).judgement
-    small, large = (calibration.answer(found.hypotheses, coverage) for coverage in (0.5, 0.95))
-    assert found.coverage == 0.95 and found.members == large and len(small) < len(large)
-    with pytest.raises(DataError, match=r"at most 0\.975, for which 39 ") as refusal:
-        diagnose(clean, library=FEW, coverage=0.98, calibration=calibration)
-    assert refusal.value.code == "bad-coverage"
-    with pytest.raises(DataError) as refusal:
-        diagnose(clean, library=())
-    assert refusal.value.code == "bad-library"

@@ -84,13 +84,13 @@ def test_what_a_rival_leaves_is_what_noisy_data_hold_against_it(evidence: Eviden
         return disc.residual + np.linalg.solve(white[disc.index], rng.standard_normal(disc.residual.size))
 
     falls = []
-    for _ in range(300):
+    for _ in range(100):
         left = left_by_hypotheses(with_left(exact, noisy))
         falls.append(left_of(left).chi2 - left_of(left, "dark_offset").chi2)
     error = 2 * np.sqrt(lam / len(falls))
     # One parameter gains 1 from noise alone.
     assert np.mean(falls) == pytest.approx(lam + 1, abs=4 * error)
-    assert np.std(falls) == pytest.approx(2 * np.sqrt(lam), rel=0.15)
+    assert np.std(falls) == pytest.approx(2 * np.sqrt(lam), rel=0.2)
 
 
 def test_a_negative_share_of_light_is_no_rival(evidence: Evidence) -> None:

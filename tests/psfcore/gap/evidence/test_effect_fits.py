@@ -90,7 +90,7 @@ def test_a_measured_change_must_gain_what_its_numbers_cost(evidence: Evidence) -
 
 def test_p_values_of_noise_are_uniform(solution: Solution) -> None:
     """Of a free parameter, and of the many parameters of a random field."""
-    draws = 100
+    draws = 50
     for name in ("dark_offset", "flat_field_residual"):
         bare = discs_only(gather(solution, [effect for effect in EFFECTS if effect.name == name]))
         model = LinearModel(bare, FLOOR)
@@ -104,7 +104,7 @@ def test_p_values_of_noise_are_uniform(solution: Solution) -> None:
 
 def test_the_p_value_of_a_gap_is_hardly_ever_small_for_noise(evidence: Evidence) -> None:
     """The smallest of four p-values times four is at least as large as a uniform number."""
-    draws = 100
+    draws = 50
     model = LinearModel(evidence, FLOOR)
     values = np.array([p_value_of_gap(drawn(model, {}, seed)) for seed in range(draws)])
     for level in (0.3, 0.1, 0.02):

@@ -9,6 +9,7 @@ import pytest
 import scipy.linalg
 from scipy.stats import multivariate_normal
 
+from psfcore.gap.evidence.effect_fits import means
 from psfcore.gap.evidence.evidence import Evidence, gather
 from psfcore.gap.evidence.linear_model import FLOOR, UNLIKELY, LinearModel
 from psfcore.gap.library.detector import EFFECTS
@@ -77,7 +78,7 @@ def test_the_gain_of_means_is_that_of_a_free_brightness_of_each_disc(evidence: E
     own = scipy.linalg.block_diag(*levels)
     left = np.concatenate(model.left(step))
     fall = chi2_left(design.T, left) - chi2_left(np.vstack([design, own]).T, left)
-    gain, directions = model.gain_of_patterns(step, model.means, model.left(step))
+    gain, directions = model.gain_of_patterns(step, means(model.evidence), model.left(step))
     assert gain == pytest.approx(fall, rel=1e-3)
     assert len(model.discs) - len(columns) <= directions <= len(model.discs)
 

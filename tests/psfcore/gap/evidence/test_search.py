@@ -21,13 +21,12 @@ from psfcore.gap.evidence.search import NearDisc, cut, displaced, distinguished,
 from psfcore.gap.library.optics import ANGLES_DEG, BETWEEN_THEM, BLURS, DIRECTIONS, HALOS, blur_as
 from psfcore.gap.view import View
 from psfcore.psf import crop_or_pad
-from psfcore.scatter.inversion import invert
 from psfcore.scatter.optics import Blur
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.transit import simulate
 from psfcore.transit.occulter import coverage
 from psfcore.transit.transit import Transit
-from tests.psfcore.gap.small_transits import clean, effect, solution, view
+from tests.psfcore.gap.small_transits import clean, effect, fit, solution, view
 from tests.transit_files import TRUTH, diffraction
 
 Plane = NDArray[np.float64]
@@ -118,9 +117,9 @@ def test_a_turned_mesh_is_found_at_its_angle() -> None:
     turned = np.maximum(rotate(cross, 12.0, reshape=False, order=1), 0.0)
     plan = default_plan(12, 128, oversampling=1, brightness=8.0)
     transit = simulate(plan, TRUTH, turned / turned.sum(), seed=4).transit
-    fit = invert(replace(transit, diffraction=cross))
-    mesh, seen = effect("mesh_rotation"), View(fit)
-    model = LinearModel(gather(fit, [mesh], view=seen), FLOOR)
+    turned_mesh = fit(replace(transit, diffraction=cross))
+    mesh, seen = effect("mesh_rotation"), View(turned_mesh)
+    model = LinearModel(gather(turned_mesh, [mesh], view=seen), FLOOR)
     angle_deg, sigma_deg, unit = fit_effects(model, [mesh]).values["angle"]
     assert unit == "deg" and angle_deg == pytest.approx(12.0, abs=2.0) and sigma_deg < 2.0
     assert mesh.distinguished is not None
@@ -143,8 +142,8 @@ def test_a_wide_halo_is_found_at_about_its_width() -> None:
     y, x = np.indices(kernel.shape) - 127
     wide = np.exp(-np.hypot(x, y) / 30.0)
     transit = simulate(plan, TRUTH, 0.8 * kernel + 0.2 * wide / wide.sum(), seed=4).transit
-    fit = invert(replace(transit, diffraction=kernel))
-    seen, halo, size = View(fit), effect("wide_halo"), fit.total.size
+    seen, halo = View(fit(replace(transit, diffraction=kernel))), effect("wide_halo")
+    size = seen.solution.total.size
     gains = place_search(seen).wide_kernels([one(size) for one in HALOS])
     assert 2 <= int(np.argmax(gains)) < 6
     assert halo.distinguished is not None and halo.held is not None
@@ -153,7 +152,7 @@ def test_a_wide_halo_is_found_at_about_its_width() -> None:
     # Of the search, not of the refit.
     assert held(view()) == halo.distinguished(seen) == pytest.approx(distinguished(gains))
     library = [halo, effect("dark_offset")]
-    model = LinearModel(gather(fit, library, view=seen), FLOOR)
+    model = LinearModel(gather(seen.solution, library, view=seen), FLOOR)
     share, sigma, _ = fit_effects(model, library[:1]).values["share"]
     assert share > 5 * sigma
 
@@ -175,16 +174,16 @@ def brightening(share: float) -> Transit:
 
 def test_a_changing_sun_shows_only_in_the_unocculted_field() -> None:
     for share in (0.0, 1.0):
-        fit = solution() if share == 0 else invert(brightening(share))
-        evidence = gather(fit, [effect("scene_evolution")])
+        seen = solution() if share == 0 else fit(brightening(share))
+        evidence = gather(seen, [effect("scene_evolution")])
         columns = evidence.columns["scene_evolution"]
         assert all((disc.jacobian[list(columns)] == 0).all() for disc in evidence.discs)
-        seen = fit_effects(LinearModel(evidence, FLOOR), evidence.effects)
+        sun = fit_effects(LinearModel(evidence, FLOOR), evidence.effects)
         # It pays for every number measured in the unocculted field, but for no more than that field has.
         assert 10 < evidence.numbers_of(columns) < evidence.all_unocculted.freedom
-        assert (seen.p_value < 1e-6) == (share > 0)
+        assert (sun.p_value < 1e-6) == (share > 0)
         # The change is linear in time, so the uneven part is left out.
-        assert set(seen.values) == ({"rms"} if share > 0 else set())
+        assert set(sun.values) == ({"rms"} if share > 0 else set())
 
 
 def test_templates_that_explain_the_data_equally_well_are_not_distinguished() -> None:
@@ -200,7 +199,7 @@ def test_a_copy_is_found_at_its_place_with_its_blur() -> None:
         replace(f, pixels=f.pixels + 0.06 * displaced(gaussian_filter(f.pixels, 8.0), dx, dy))
         for f in clean(12).frames
     )
-    blur_px, x, y = place_search(View(invert(replace(clean(12), frames=frames)))).copy
+    blur_px, x, y = place_search(View(fit(replace(clean(12), frames=frames)))).copy
     assert (x, y) == pytest.approx((dx, dy), abs=4) and blur_px in (4.0, 8.0)
 
 
@@ -210,7 +209,7 @@ def test_the_direction_of_a_directional_blur_is_found() -> None:
         replace(f, pixels=along_line(f.pixels.astype(np.float64)).astype(np.float32))
         for f in clean(12).frames
     )
-    seen = View(invert(replace(clean(12), frames=frames)))
+    seen = View(fit(replace(clean(12), frames=frames)))
     (found,) = effect("core_blur").changes(seen)
     first = found.change(0, seen.expected)
     (same,) = [
@@ -276,7 +275,7 @@ def test_a_patch_gives_the_same_response_as_the_whole_field() -> None:
 
 def test_a_field_smaller_than_a_patch_is_used_whole() -> None:
     plan = default_plan(12, 76, oversampling=1, brightness=8.0)
-    small = View(invert(simulate(plan, TRUTH, diffraction(), seed=3).transit))
+    small = View(fit(simulate(plan, TRUTH, diffraction(), seed=3).transit))
     shape, n = small.solution.transit.shape, small.solution.part[0]
     (disc,) = near_discs(small, [n])
     change = along_line(small.kernel) - small.kernel

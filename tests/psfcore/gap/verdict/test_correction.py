@@ -19,25 +19,24 @@ from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
 from psfcore.gap.evidence.search import displaced
 from psfcore.gap.verdict import correction
 from psfcore.gap.verdict.correction import Corrected, add_to_model, images_without
-from psfcore.gap.verdict.same_data import with_same_data
+from psfcore.gap.verdict.posterior import with_same_data
 from psfcore.gap.view import View
-from psfcore.scatter.inversion import invert
 from psfcore.scatter.reconstruction import Solution
 from psfcore.transit.transit import Frame, Transit
 from tests.psfcore.gap.small_gaps import changed
-from tests.psfcore.gap.small_transits import clean, effect
+from tests.psfcore.gap.small_transits import clean, effect, fit
 
 
 def fit_of(change: Any, effects: Sequence[Effect]) -> tuple[Solution, LinearModel]:
     """The fit to twelve images that were changed, and its linear model."""
-    fit = invert(changed(clean(12), change))
-    return fit, LinearModel(gather(fit, effects), FLOOR)
+    solution = fit(changed(clean(12), change))
+    return solution, LinearModel(gather(solution, effects), FLOOR)
 
 
 def test_a_round_that_leaves_more_than_the_previous_one_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     """An offset of 1 DN; the second round also subtracts light that was never added."""
     offset = effect("dark_offset")
-    fit, model = fit_of(lambda n, frame: frame.pixels + 1.0 / frame.exposure_s, [offset])
+    solution, model = fit_of(lambda n, frame: frame.pixels + 1.0 / frame.exposure_s, [offset])
     taken_out: list[float] = []
     as_it_is = correction.images_without
 
@@ -53,7 +52,7 @@ def test_a_round_that_leaves_more_than_the_previous_one_is_rejected(monkeypatch:
 
     monkeypatch.setattr(correction, "images_without", spoiled)
     monkeypatch.setattr(correction, "SETTLED", 0.0)
-    added = add_to_model(fit, [offset], fit_effects(model, [offset]), model)
+    added = add_to_model(solution, [offset], fit_effects(model, [offset]), model)
     value, sigma, _ = added.values["offset"]
     assert len(taken_out) == 2 and added.rounds == 1
     assert value == pytest.approx(1.0, abs=4 * sigma)
@@ -70,7 +69,7 @@ def test_a_refit_of_several_rounds_computes_the_jacobian_once(monkeypatch: pytes
     """A plane of light; the model at the refit is that of a new linear model of the images without this plane."""
     plane = effect("intensity_gradient")
     x = np.indices(clean(12).shape)[1] / clean(12).shape[1] - 0.5
-    fit, model = fit_of(lambda n, frame: frame.pixels + 4.0 + 8.0 * x, [plane])
+    solution, model = fit_of(lambda n, frame: frame.pixels + 4.0 + 8.0 * x, [plane])
     gathered: list[Evidence] = []
 
     def counted(*given: Any, **named: Any) -> Evidence:
@@ -80,7 +79,7 @@ def test_a_refit_of_several_rounds_computes_the_jacobian_once(monkeypatch: pytes
     monkeypatch.setattr(correction, "gather", counted)
     monkeypatch.setattr(correction, "SETTLED", 0.0)
     offset = effect("dark_offset")
-    added = add_to_model(fit, [plane], fit_effects(model, [plane]), model, beside=[offset])
+    added = add_to_model(solution, [plane], fit_effects(model, [plane]), model, beside=[offset])
     assert added.rounds > 1 and len(gathered) == 1
     for name, true in (("level", 4.0), ("slope_x", 8.0), ("slope_y", 0.0)):
         value, sigma, _ = added.values[name]
@@ -116,11 +115,11 @@ def test_a_refit_gives_the_parameters_of_each_effect() -> None:
 def test_a_share_of_light_cannot_be_negative() -> None:
     """Images that lost a share of their columns' light: a smear that adds light must not explain them."""
     smear = effect("column_smear")
-    fit, model = fit_of(lambda n, frame: frame.pixels - 0.03 * frame.pixels.mean(axis=0), [smear])
+    solution, model = fit_of(lambda n, frame: frame.pixels - 0.03 * frame.pixels.mean(axis=0), [smear])
     below = fit_effects(model, [smear], any_sign=True)
     assert all(value < 0 for value, _, _ in below.values.values())
     with pytest.raises(DataError, match="expected column_smear to add light") as refusal:
-        add_to_model(fit, [smear], below, model)
+        add_to_model(solution, [smear], below, model)
     assert refusal.value.code == "effect-unseen"
 
 
@@ -135,10 +134,9 @@ def test_a_subtracted_effect_scales_with_the_brightness_of_the_image() -> None:
         return (frame.pixels + 0.4 * copied(0, [frame.pixels])) * (1 + 0.02 * rng.standard_normal())
 
     copy = replace(effect("ghost"), changes=lambda view: [Change(copied, unocculted=False)], held=None)
-    fit = invert(changed(clean(12), with_copy))
-    view = View(fit)
-    before = gather(fit, [copy], view=view)
-    after = gather(invert(images_without(fit.transit, view, [copy], np.array([0.4]))), [copy])
+    view = View(fit(changed(clean(12), with_copy)))
+    before = gather(view.solution, [copy], view=view)
+    after = gather(fit(images_without(view.solution.transit, view, [copy], np.array([0.4]))), [copy])
     blocks = replace(after.unocculted, variance=before.unocculted.variance)
     assert replace(after, unocculted=blocks).all_unocculted.chi2 < before.all_unocculted.chi2 * 1.02
 

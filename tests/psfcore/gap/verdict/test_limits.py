@@ -29,7 +29,7 @@ from tests.psfcore.gap.linear_models import drawn, effect_of
 
 THRESHOLD = 0.05
 DRAWS = 150  # with 60, noise alone leaves the tested range once in thirty times
-FEWER_DRAWS = 25
+FEWER_DRAWS = 15
 ANSWER = Calibration(1.0, (THRESHOLD,) * 9, {})
 
 

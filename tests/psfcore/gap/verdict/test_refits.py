@@ -15,12 +15,11 @@ from psfcore.gap.evidence.fields import LIKELY, Field, fields_of
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
 from psfcore.gap.verdict import refits as refitting
 from psfcore.gap.verdict.posterior import Form, posterior, without_idle
-from psfcore.gap.verdict.refits import Refits
-from psfcore.gap.verdict.settled import settled_posterior
+from psfcore.gap.verdict.refits import Refits, settled_posterior
 from psfcore.gap.view import View
-from psfcore.scatter.inversion import invert
+from studies import gap_calibration
 from tests.psfcore.gap.small_gaps import OFFSET_DN, changed, found
-from tests.psfcore.gap.small_transits import clean, effect
+from tests.psfcore.gap.small_transits import clean, effect, fit
 
 OFFSET, BOTH, BLUR = (
     Form(names) for names in (("dark_offset",), ("dark_offset", "core_blur"), ("core_blur",))
@@ -68,9 +67,10 @@ def test_a_refit_weighs_its_effect_all_pairs_with_it_and_the_triples_of_the_best
     settled = before.with_evidence(weighed, model)
     assert next(iter(without_idle(settled.probabilities()))) == ("dark_offset",)
     # The offset changes the cells by less than their noise, which hides how far the refit departs from first order.
-    assert made.departures == []
-    monkeypatch.setattr(refitting, "VISIBLE_SIGMA", 0.5)
-    assert len(made.departures) == 1 and 0 < made.departures[0] < 0.5
+    assert gap_calibration.departures_of(made) == ()
+    monkeypatch.setattr(gap_calibration, "VISIBLE_SIGMA", 0.5)
+    (departure,) = gap_calibration.departures_of(made)
+    assert 0 < departure < 0.5
 
     # A refit is made once, and rivals are not refitted for the report.
     def again(*given: Any, **named: Any) -> None:
@@ -107,7 +107,7 @@ def test_a_failed_refit_is_named_once_and_left_out(monkeypatch: pytest.MonkeyPat
     # After two failed refits no third one is tried for the report.
     assert refits.of([OFFSET, BOTH, BLUR]) == ()
     assert asked == [["dark_offset"], ["dark_offset", "core_blur"]]
-    assert refits.made == {} and refits.departures == []
+    assert refits.made == {}
     first, second = refits.failures
     assert "dark_offset in the model failed: " in first and "expected dark_offset to add light" in first
     assert "dark_offset + core_blur" in second
@@ -135,12 +135,11 @@ def test_a_second_effect_is_found_in_the_discs_beside_one_of_the_unocculted_fiel
     transit = changed(
         clean(), lambda n, f: (f.pixels + 6.0 + 20.0 * x) * (1.1 if f.gain_mode == "combined" else 1.0)
     )
-    solution = invert(transit)
+    solution = fit(transit)
     view = View(solution)
     library = [effect(name) for name in ("gain_mismatch", "intensity_gradient", "dark_offset", "core_blur")]
     model = replace(LinearModel(gather(solution, library, view=view), FLOOR), scale_error=0.1)
-    settled, failed = settled_posterior(posterior(model), Refits(view, model).weighed)
+    settled = settled_posterior(posterior(model), Refits(view, model).weighed)
     shares = without_idle(settled.probabilities())
     best = next(iter(shares))
     assert set(best) == {"gain_mismatch", "intensity_gradient"} and shares[best] > 0.9
-    assert best not in failed

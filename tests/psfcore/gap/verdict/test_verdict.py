@@ -144,8 +144,8 @@ def test_the_set_has_the_coverage_that_was_asked_for() -> None:
     assert refusal.value.code == "bad-coverage"
     # The refits of all hypotheses that name effects failed.
     nothing = posterior_of({NONE: 0.3, UNKNOWN: 0.7})
-    found = verdict_of(nothing, calibration, images=12, failed=(A, B))
-    assert (found.best, found.answer, found.failed) == (None, (), (A, B))
+    found = verdict_of(nothing, calibration, images=12)
+    assert (found.best, found.answer) == (None, ())
 
 
 def test_further_cases_are_covered_as_stated() -> None:
