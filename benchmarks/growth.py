@@ -42,7 +42,7 @@ import heliopsf
 from benchmarks.bulk import make_archive, worked_through
 from benchmarks.figures import kind_of_machine, tell
 from benchmarks.timing import THREADS, answer_of, memory_bytes, reference, seconds
-from psfcore.deconvolve.memory import Asked, deconvolution_bytes
+from psfcore.deconvolve.memory import Demand, deconvolution_bytes
 from psfcore.deconvolve.methods.registry import method_names
 from psfcore.psf import central_part
 from psfcore.scatter.fit import fit_transit
@@ -91,7 +91,7 @@ def deconvolution(case: dict[str, Any]) -> Point:
     psf = heliopsf.build_psf("hri_euv")
     if "psf" in case:
         psf = heliopsf.Psf.of(central_part(psf, case["psf"]))
-    work = Asked(method, (size, size), (psf.kernel.shape[0], psf.kernel.shape[1]))
+    work = Demand(method, (size, size), (psf.kernel.shape[0], psf.kernel.shape[1]))
     pixels = np.random.default_rng(0).gamma(2.0, 400.0, (size, size))
 
     def deconvolve(part: Any, iterations: int) -> Any:
@@ -129,7 +129,7 @@ def measured(kind: str, n: float, **case: Any) -> Point:
 def image_size(values: list[int]) -> Iterator[Point]:
     """Images, with the PSF of 2048 px. One that does not fit into the free memory is left out."""
     for size in values:
-        needed = deconvolution_bytes(Asked("richardson-lucy", (size, size), (2048, 2048)))
+        needed = deconvolution_bytes(Demand("richardson-lucy", (size, size), (2048, 2048)))
         if needed > free_bytes():
             print(f"left out: {size} px need {needed / MIB:.0f} MiB, more than the free memory")
             continue

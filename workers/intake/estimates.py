@@ -160,7 +160,9 @@ def _deconvolution(parameters: Mapping[str, Any], catalogue: Catalogue, owner: s
     return cpu_s, max(built_mib, product_bytes(asked, whole_px) / MIB)
 
 
-def _build(parameters: Mapping[str, Any], catalogue: Catalogue, owner: str) -> tuple[float, float]:
+def _build(
+    parameters: Mapping[str, Any], catalogue: Catalogue | None = None, owner: str = ""
+) -> tuple[float, float]:
     cost = COSTS.kinds.psf_build
     size = max(parameters["size"], cost.grid_px)
     grid = size / cost.grid_px
@@ -187,7 +189,7 @@ def _build(parameters: Mapping[str, Any], catalogue: Catalogue, owner: str) -> t
         cost.cell_bytes * max(work.cells, default=0),
         cost.entry_bytes * work.mount_entries + cost.spectrum_bytes * work.mask_cells * size,
     )
-    mask = catalogue.get(ImageRow, parameters.get("mask_id") or "", owner)
+    mask = None if catalogue is None else catalogue.get(ImageRow, parameters.get("mask_id") or "", owner)
     if mask is not None:
         arrays += cost.image_bytes * math.prod(mask.summary["shape"])
     return len(instrument.spectral_lines) * line_s, meshes_mib + cost.grid_mib * grid**2 + arrays / MIB
