@@ -20,7 +20,6 @@ from tempfile import TemporaryDirectory, gettempdir
 from typing import Any
 
 import numpy as np
-from psfcore.simulate.transit_files import write
 
 from benchmarks.figures import tell
 from benchmarks.timing import THREADS, answer_of, measured_process, peak_gib, reference, seconds
@@ -38,7 +37,7 @@ from psfcore.scatter.fit import fit_transit
 from psfcore.scatter.report import fit_sentence
 from psfcore.simulate.observe import demo_image
 from psfcore.simulate.plan import default_plan
-from psfcore.simulate.transit import simulate
+from psfcore.simulate.transit import simulate, write
 from psfcore.transit.folder import read_transit
 from tests.transit_files import drawn_truth, hri_diffraction
 
