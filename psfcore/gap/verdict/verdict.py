@@ -12,8 +12,8 @@ but improbable:
 | several hypotheses, which all name effects | tie | the effects of all of them |
 | anything else | inconclusive | the effects of the most probable hypothesis that names effects |
 
-A name must earn itself: "unknown" joins the answer set, and the verdict is `inconclusive`, if the effects of the best named hypothesis
-do not shrink the gap on held-out images, or if the upper end of the 90 % interval of their closure is below EARNED.
+A name must earn itself: if the effects of the best named hypothesis close less than EARNED of the gap on held-out images (the upper
+end of the 90 % interval), "unknown" joins the answer set, and the verdict is `inconclusive`.
 
 With fewer than LEAST_IMAGES images, the verdict is `inconclusive` instead of `none`: no image can be held out, and a gap may
 exist although the images do not show it.
@@ -132,9 +132,7 @@ def earned(judged: Judgement, closure: Interval | None) -> Judgement:
 
     closure: of the best named hypothesis; None if the discs show no gap, or if no image can be held out.
     """
-    if judged.verdict not in ("attributed", "tie") or closure is None:
-        return judged
-    if closure.high >= EARNED and closure.value > 0:
+    if judged.verdict not in ("attributed", "tie") or closure is None or closure.high >= EARNED:
         return judged
     if any(UNKNOWN_NAME in names for names in judged.deciding):
         return judged
