@@ -28,7 +28,7 @@ from psfcore.build import build_psf
 from psfcore.deconvolve.conditions import Conditions, PreparedPsfs
 from psfcore.deconvolve.methods.registry import method_named
 from psfcore.diffraction.design_study import design_study
-from psfcore.diffraction.mesh_series import rotated_mesh_kernel
+from psfcore.diffraction.mesh_series import order_spacing_px, rotated_mesh_kernel
 from psfcore.drawing.plots import preview_png
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.observation import read_observation
@@ -50,14 +50,7 @@ CODE = {
     "heliopsf --version": "from service.cli.main import main; main(['--version'])",
 }
 TOTAL, ASYMMETRIC = "PSF of HRI_EUV, 2048 px", "PSF with a mount without symmetry, 2048 px"
-ENTRANCE_MESH: dict[str, Any] = {
-    "wavelength_angstrom": 174.0,
-    "distance_mm": 4187.0,
-    "pitch_um": 1270.0,
-    "wire_um": 40.0,
-    "windows": 37,
-    "pixel_pitch_um": 10.0,
-}
+PITCH_UM = 1270.0  # of the entrance mesh of HRI_EUV
 DIAGNOSED = SetPlan(cases=1, seed=7, size_px=512, images=30, only=("ghost",), left_pct=(10.0,))
 
 
@@ -143,10 +136,13 @@ def quick(folder: Path, f_s: float) -> None:
     plane = np.random.default_rng(0).random((SIZE_PX, SIZE_PX)) * 1000
     pitches_um = [300.0 + 300 * step for step in range(8)]
     picture = folder / "preview.png"
+    spacing_px = order_spacing_px(
+        wavelength_angstrom=174.0, distance_mm=4187.0, pitch_um=PITCH_UM, pixel_pitch_um=10.0
+    )
     calls: dict[str, Callable[[], object]] = {
         "preview, 2048 px": lambda: preview_png(plane, plane * 1.1, picture, title="timed", unit="DN/s"),
         "orders of a rotated mesh, 2048 px": lambda: rotated_mesh_kernel(
-            **ENTRANCE_MESH, angle_deg=45.0, size=SIZE_PX
+            spacing_px, pitch_um=PITCH_UM, wire_um=40.0, windows=37, angle_deg=45.0, size=SIZE_PX
         ),
         "design study of 32 meshes": lambda: design_study(hri, pitches_um, [20, 30, 40, 50]),
     }
