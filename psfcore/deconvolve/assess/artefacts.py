@@ -129,9 +129,8 @@ def classes_of(brightness: Plane) -> BrightnessClasses:
     share, more = divmod(keys.size, _BRIGHTNESS_CLASSES)
     counts = share + (np.arange(_BRIGHTNESS_CLASSES) < more)
     starts = np.cumsum(counts) - counts
-    middles = np.transpose(
-        [starts + (counts - 1) // 2, starts + counts // 2]
-    )  # their median is that of the class
+    # The median of a class is that of its one or two middle members.
+    middles = np.transpose([starts + (counts - 1) // 2, starts + counts // 2])
     keys.partition(np.unique([*starts, *middles.ravel()]))
     keys &= 0xFFFFFFFF
     return BrightnessClasses(

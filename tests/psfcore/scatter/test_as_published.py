@@ -105,6 +105,14 @@ def test_a_subset_has_equal_numbers_from_each_stratum_and_unocculted_ones() -> N
         choose_subset(some(whole, whole.stratum == UNOCCULTED), rng)
 
 
+def test_equations_of_frames_are_joined_in_order() -> None:
+    whole = made_equations()
+    half = np.arange(len(whole)) < 1500
+    joined = Equations.joined([some(whole, half), some(whole, ~half)])
+    for name in ("observed", "ring_sums", "unscattered", "scale", "stratum"):
+        np.testing.assert_array_equal(getattr(joined, name), getattr(whole, name))
+
+
 def test_free_shells_are_those_planted_and_a_seed_gives_one_fit() -> None:
     found, full = free_fit(made_equations(), COUNTS, seed=1, subsets=10), COUNTS > 0
     assert found.fits.shape == (7, COUNTS.size)

@@ -25,11 +25,12 @@ from psfcore.scatter.interpolation import (
     parameters_of,
     weight_at,
 )
+from psfcore.scatter.inversion import invert
 from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW
 from psfcore.scatter.total_psf import CURVE_RADII_PX, possible_psfs
 from psfcore.simulate.scatter_truth import ScatterTruth, total_kernel
 from tests.psfcore.conftest import LIMITS
-from tests.psfcore.small_transits import DIFFRACTION
+from tests.psfcore.small_transits import DIFFRACTION, observed, sky, solved
 
 T0, T1 = datetime(2022, 3, 1, tzinfo=UTC), datetime(2023, 3, 1, tzinfo=UTC)
 MIDDLE = T0 + (T1 - T0) / 2
@@ -105,6 +106,27 @@ def test_a_steady_change_is_found_within_a_tenth_of_a_point() -> None:
         truth = cumulative_curve(total_kernel(between(weight), DIFFRACTION), RADII)
         assert np.abs(curve(psf) - truth).max() < 0.1, weight
         assert (psf.instrument, psf.plate_scale_arcsec, psf.status) == ("hri_euv", 0.492, "draft")
+
+
+def fitted_at(truth: ScatterTruth, seed: int) -> Psf:
+    """The PSF that the inversion of a noisy simulated transit finds."""
+    inversion = solved().inversion if truth == EARLY else invert(observed(sky(truth), seed).transit).inversion
+    at = inversion.coordinates
+    values = dict(zip(("b_px", "c", "total"), inversion.shape.values(at).values(), strict=True))
+    found = psf_of(ScatterTruth(**values))
+    covariance = tuple(tuple(row) for row in inversion.covariance.tolist())
+    assert found.fitted is not None
+    return dataclasses.replace(found, fitted=dataclasses.replace(found.fitted, covariance=covariance))
+
+
+def test_between_two_fitted_transits_the_curve_agrees_with_the_truth_within_its_error() -> None:
+    """Two transits with noise are simulated with known scatter and fitted; the truth in the middle is that of a steady change."""
+    before, after = fitted_at(EARLY, 3), fitted_at(LATE, 3)
+    psf = made(before, after)
+    truth = cumulative_curve(total_kernel(between(0.5), DIFFRACTION), RADII)
+    off, sigma = np.abs(curve(psf) - truth), curve_sigma(psf, RADII)
+    assert (off <= np.maximum(0.3, sigma)).all()
+    assert sigma.max() < 3.0, "a stated error that says nothing would agree with every truth"
 
 
 def test_the_stated_error_is_that_of_a_sudden_change_at_an_unknown_time() -> None:

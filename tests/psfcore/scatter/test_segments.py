@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from psfcore.convolution.convolver import Convolver
 from psfcore.errors import DataError
 from psfcore.psf import squared_radii
 from psfcore.scatter.power_law import scatter_kernel
@@ -83,6 +84,18 @@ def test_light_lands_at_source_plus_offset() -> None:
     targets = np.array([[20, 22], [16, 20], [23, 16], [20, 20]])
     expected = np.vstack((7.0 * np.eye(3), np.zeros(3)))
     np.testing.assert_array_equal(segment_sums(image, targets, segments), expected)
+
+
+def test_sums_weighted_by_segment_are_the_convolution() -> None:
+    """sum over S of psf_S A_S is the image convolved with the kernel that is psf_S on S."""
+    image, targets = scene((64, 80)), some_targets((64, 80), 30)
+    segments = Segments(PIXEL_WIDE, 128)
+    weights = np.random.default_rng(1).random(segments.size)
+    kernel = np.append(weights, 0.0)[segments.label_map(128)]
+    convolved = Convolver(kernel, image.shape, dtype=np.float64).apply(image)
+    np.testing.assert_allclose(
+        segment_sums(image, targets, segments) @ weights, convolved[tuple(targets.T)], rtol=1e-9
+    )
 
 
 def test_dark_segments_of_a_bright_image_are_exactly_dark() -> None:

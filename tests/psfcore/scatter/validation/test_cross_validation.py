@@ -93,6 +93,20 @@ def test_a_fold_reports_progress_before_every_image(monkeypatch: pytest.MonkeyPa
     assert stages["settling"] == stages["free shells"] != []
 
 
+def test_a_progress_callback_can_stop_a_fold() -> None:
+    class Stop(Exception):
+        pass
+
+    for last in ("images held out", "settling"):
+
+        def progress(stage: str, _step: int, _steps: int, last: str = last) -> None:
+            if stage == last:
+                raise Stop
+
+        with pytest.raises(Stop):
+            exact_fit(solved(), bootstrap_samples(IMAGES, runs=1)[1], progress=progress)
+
+
 def test_both_schemes_agree() -> None:
     wanted = bootstrap_samples(IMAGES, runs=1)
     quick = shared_fits(solved(), wanted)
