@@ -14,8 +14,8 @@ from psfcore.gap.effect import EffectParameter as Parameter
 from psfcore.gap.evidence.unocculted_blocks import spread_blocks, unocculted_blocks
 from psfcore.gap.view import Field, View
 
-# Decay levels of two losses; their sum approximates a loss with any decay level in between.
-FAINT_DN = (30.0, 150.0)
+# Decay levels of losses, DN. Their sum approximates any loss that falls off smoothly with the counts, also that of charge traps.
+FAINT_DN = (10.0, 40.0, 160.0, 640.0, 2560.0)
 # Decay times, in units of the mean interval between images. Sums of these decays and of a fraction of the previous image
 # approximate charge traps.
 FADES_IN = {"one_wait": 1, "three_waits": 3}
@@ -167,7 +167,7 @@ EFFECTS: tuple[Effect, ...] = (
            ("detector_x", "detector_y"), _gradient),
     Effect("gain_mismatch", "detector", (Parameter("excess", "", 0.05),), "Combined-gain and high-gain images differ in their calibrated gain.",
            "images of the same scene in both gain modes", ("gain_mode", "exposure"), _gain_mismatch, _one_gain_mode),
-    Effect("nonlinearity", "detector", (Parameter("loss", "", 0.05), Parameter("loss_beyond", "", 0.05)), "The detector reads faint signals too low.",
+    Effect("nonlinearity", "detector", tuple(Parameter(f"loss_{level:g}_dn", "", 0.05) for level in FAINT_DN), "The detector reads faint signals too low.",
            "a series of exposure times at one pointing", ("intensity",), _nonlinearity),
     Effect("flat_field_residual", "detector", tuple(Parameter(f"cos_{kx}x_{ky}y", "", 0.02) for kx, ky in _half_waves()),
            "The flat field leaves a smooth error of the detector's sensitivity.", "images of the same scene at several positions on the detector",
