@@ -8,7 +8,7 @@ import pytest
 from psfcore.blind.effects.scene import patches
 from psfcore.gap.diagnose import Diagnosis, diagnose
 from psfcore.gap.report.report import gap_report
-from psfcore.gap.verdict.posterior import NONE, UNKNOWN
+from psfcore.gap.verdict.posterior import NONE, UNKNOWN, Form
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.transit import simulate
 from psfcore.transit.transit import Frame, Transit
@@ -31,7 +31,7 @@ def verdict(transit: Transit) -> Diagnosis:
 
 
 def fitted(found: Diagnosis, name: str) -> dict[str, tuple[float, float, str]]:
-    return next(fit for fit in found.fits if fit.names == (name,)).values
+    return found.fits[Form((name,))].values
 
 
 def test_a_gain_mismatch_shows_in_the_unocculted_field_and_hardly_in_the_discs(clean: Transit) -> None:
@@ -58,7 +58,7 @@ def test_persistence_whatever_its_decay_time(clean: Transit) -> None:
     assert found.judgement.answer == ("persistence",)
     values = fitted(found, "persistence").values()
     assert sum(value for value, _, _ in values) == pytest.approx(0.06, rel=0.3)
-    closure = found.shrinking["persistence"].closure
+    closure = found.shrinking[Form(("persistence",))].closure
     assert closure is not None and closure.value > 0.9
 
 
@@ -68,7 +68,7 @@ def test_a_patchy_flat_field_error(clean: Transit) -> None:
     # unknown cause may also explain the patches.
     found = diagnose(changed(clean, lambda n, f: f.pixels * uneven))
     assert found.judgement.answer == ("flat_field_residual",) == found.judgement.members[0]
-    closure = found.shrinking["flat_field_residual"].closure
+    closure = found.shrinking[Form(("flat_field_residual",))].closure
     assert closure is not None and closure.value > 0.3
     # Parameters that the discs do not constrain stay near 0, so together they are no larger than the patches.
     values = fitted(found, "flat_field_residual")
@@ -87,7 +87,7 @@ def test_a_sun_that_changes_faster_than_the_images_follow_is_still_named() -> No
     # and the discs show a gap. A second effect is named for this gap.
     assert any("The fitted position of the occulter may be wrong" in caution for caution in found.cautions)
     assert all("scene_evolution" in names for names in found.judgement.members)
-    assert found.fits[0].names == ("scene_evolution",)
+    assert next(iter(found.fits)) == Form(("scene_evolution",))
 
 
 def test_a_patch_of_light_is_not_attributed_to_an_effect(clean: Transit) -> None:
