@@ -152,13 +152,14 @@ def _mean_of_lowest(values: Plane) -> float:
 def _transfer(pixels: Any, counted: Any, sigma: Any) -> tuple[float, float] | None:
     """g and r of Eq. (1) in the unit of the pixels; None for too few pixels."""
     classes = classes_of(uniform_filter(pixels, 3)[counted])
-    if not classes.members:
+    if not classes.centres.size:
         return None
+    members = [classes.numbers == number for number in range(classes.centres.size)]
     if sigma is None:
         differences = np.abs(second_difference(pixels))[counted] / 6
-        levels = [_mean_of_lowest(differences[part]) / _LOWEST_MEAN for part in classes.members]
+        levels = [_mean_of_lowest(differences[part]) / _LOWEST_MEAN for part in members]
     else:
-        levels = [float(np.median(sigma[counted][part])) for part in classes.members]
+        levels = [float(np.median(sigma[counted][part])) for part in members]
     brightness, variance = np.asarray(classes.centres, np.float64), np.array(levels) ** 2
     first, second = np.triu_indices(len(brightness), 1)
     steps = brightness[second] - brightness[first]

@@ -19,6 +19,7 @@ from psfcore.compiled import is_kept
 from psfcore.convolution import engine
 from psfcore.convolution.fft_kernels import make_plan
 from psfcore.convolution.lengths import LARGEST_LENGTH, good_length
+from psfcore.deconvolve.assess.changes import measure_changes
 from psfcore.deconvolve.conditions import Conditions
 from psfcore.deconvolve.methods.registry import method_named
 from psfcore.image import Image
@@ -60,7 +61,7 @@ def compile_kernels(method: str, shape: tuple[int, int]) -> None:
     psf = Psf(kernel=weights / weights.sum(), name="small", version="0", instrument=None, status="user")
     pixels = np.full((SIZE_PX, SIZE_PX), 100.0)
     image = Image(pixels, np.zeros(pixels.shape, np.uint8), Header(), "DN/s", 1.0)
-    method_named(method)(image, psf, Conditions(), steps=2)
+    measure_changes(image, method_named(method)(image, psf, Conditions(), steps=2).pixels, psf)
     for size in set(shape):
         make_plan(good_length(min(size + min(size, REACH_GRID_PX // 2), LARGEST_LENGTH)))
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from psfcore import software_version
 from psfcore.deconvolve.assess.quality import MEANINGS
+from psfcore.deconvolve.assess.ranks import percentiles
 from psfcore.deconvolve.box import EXPECTED_RIM_PX
 from psfcore.deconvolve.conditions import Deconvolved, PreparedPsfs, Progress
 from psfcore.deconvolve.doubts import input_warnings
@@ -128,8 +129,8 @@ class Product(Deconvolved):
         used, provenance: of the PSF, if its file does not say them. A bright pixel is at or above the 99th percentile of the input; a dark pixel is at or below the first percentile.
         """
         image, box, saturation = self.image, self.of_box, self.image.saturation
-        before, after = image.pixels[image.valid], self.pixels[image.valid]
-        low, high = np.percentile(before, [1, 99])
+        before, after = (plane[image.valid].astype(np.float32) for plane in (image.pixels, self.pixels))
+        low, high = percentiles(before, [1, 99])
         dark, bright = before <= low, before >= high
         psf = used or self.psf
         return {
@@ -388,7 +389,7 @@ def deconvolution_history(product: Product, psf: UsedPsf) -> list[str]:
     ]
 
 
-def _change_pct(before: NDArray[np.float64], after: NDArray[np.float64]) -> float | None:
+def _change_pct(before: NDArray[np.float32], after: NDArray[np.float32]) -> float | None:
     """Change of the summed intensity, in percent; None if the sum of the input is not positive."""
-    total = float(before.sum())
-    return 100 * (float(after.sum()) / total - 1) if total > 0 else None
+    total = float(before.sum(dtype=np.float64))
+    return 100 * (float(after.sum(dtype=np.float64)) / total - 1) if total > 0 else None

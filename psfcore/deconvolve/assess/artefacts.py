@@ -38,6 +38,8 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.deconvolve.assess import ranks
+
 HOLE_SHARE = 0.02
 DETECTION_SIGMA = 5.0
 EXTREME_SIGMA = 8.0
@@ -86,8 +88,11 @@ def find_artefacts(
     # Single precision is accurate enough for these filters, and twice as fast.
     filled_before, filled_after = (filled(plane).astype(np.float32) for plane in (before, after))
     classes = classes_of(filled_before[counted])
-    noise_after = _estimated_noise(filled_after, filled_before, counted, classes)
-    noise_before = sigma or _estimated_noise(filled_before, filled_before, counted, classes)
+    noise_after = noise_levels(filled_after, counted, classes)
+    noise_before = sigma
+    if noise_before is None:
+        levels = noise_levels(filled_before, counted, classes)
+        noise_before = lambda at: levels.at(filled_before[at])  # noqa: E731
     holes = _holes(filled_before, filled_after, counted, noise_before)
     overshoots = _overshoots(filled_before, filled_after, counted, noise_before, peak_weight)
     extremes = counted & _new_extremes(filled_before, filled_after, noise_before, noise_after)
@@ -109,33 +114,20 @@ def find_artefacts(
 class BrightnessClasses:
     """Classes of pixels by brightness. All classes have the same number of pixels.
 
-    members: indices of the pixels of each class. centres: median brightness of each class.
+    numbers: the class of each pixel (n,). centres: median brightness of each class; empty: there are no classes.
     """
 
-    members: list[NDArray[np.intp]]
-    centres: Plane
+    numbers: ranks.Groups
+    centres: NDArray[np.float64]
 
 
 def classes_of(brightness: Plane) -> BrightnessClasses:
     """Divide pixels into classes by their brightness (n,). With fewer than 16 pixels there are no classes."""
-    if brightness.size < _BRIGHTNESS_CLASSES:
-        return BrightnessClasses([], np.empty(0))
-    # A full sort would take five times as long. The upper half of a key is the bit pattern of the brightness in single precision, which
-    # orders numbers above 0 as their values and numbers below 0 in reverse; the lower half is the index.
-    keys = brightness.astype(np.float32).view(np.int32).astype(np.int64)
-    np.subtract(-(2**31) - 1, keys, out=keys, where=keys < 0)
-    keys <<= 32
-    keys |= np.arange(keys.size, dtype=np.uint32)
-    share, more = divmod(keys.size, _BRIGHTNESS_CLASSES)
-    counts = share + (np.arange(_BRIGHTNESS_CLASSES) < more)
-    starts = np.cumsum(counts) - counts
-    # The median of a class is that of its one or two middle members.
-    middles = np.transpose([starts + (counts - 1) // 2, starts + counts // 2])
-    keys.partition(np.unique([*starts, *middles.ravel()]))
-    keys &= 0xFFFFFFFF
-    return BrightnessClasses(
-        np.split(keys, starts[1:]), np.array([np.median(brightness[keys[middle]]) for middle in middles])
-    )
+    values = np.asarray(brightness, dtype=np.float32)
+    if values.size < _BRIGHTNESS_CLASSES:
+        return BrightnessClasses(np.zeros(values.size, np.uint8), np.empty(0))
+    numbers = ranks.parts_of_equal_size(values, _BRIGHTNESS_CLASSES)
+    return BrightnessClasses(numbers, ranks.medians(values, numbers, _BRIGHTNESS_CLASSES))
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,6 +140,11 @@ class NoiseLevels:
     centres: Plane
     levels: Plane
     smallest: float
+
+    @property
+    def least(self) -> float:
+        """The noise of no pixel is below this value."""
+        return max(self.smallest, float(self.levels.min(initial=np.inf)) if self.levels.size else 0.0)
 
     def at(self, brightness: Plane) -> Plane:
         """The noise of pixels of this brightness."""
@@ -162,16 +159,10 @@ class NoiseLevels:
 
 def noise_levels(pixels: Plane, counted: Flags, classes: BrightnessClasses) -> NoiseLevels:
     """Upper limit of the noise of `pixels` [y, x], which must be finite."""
-    second = np.abs(second_difference(pixels))[counted] / 6
+    second = np.asarray(np.abs(second_difference(pixels))[counted] / 6, dtype=np.float32)
     smallest = 1e-6 * float(np.abs(pixels).max()) + np.finfo(float).tiny
-    levels = np.array([1.4826 * np.median(second[part]) for part in classes.members])
+    levels = 1.4826 * ranks.medians(second, classes.numbers, classes.centres.size)
     return NoiseLevels(classes.centres, levels, smallest)
-
-
-def _estimated_noise(pixels: Plane, brightness: Plane, counted: Flags, classes: BrightnessClasses) -> NoiseAt:
-    """The noise of pixels, estimated from the pixels themselves, as a function of their brightness."""
-    levels = noise_levels(pixels, counted, classes)
-    return lambda at: levels.at(brightness[at])
 
 
 def second_difference(plane: Plane) -> Plane:
@@ -217,15 +208,17 @@ def _overshoots(
     return overshoots
 
 
-def _new_extremes(before: Plane, after: Plane, noise_before: NoiseAt, noise_after: NoiseAt) -> Flags:
+def _new_extremes(before: Plane, after: Plane, noise_before: NoiseAt, noise_after: NoiseLevels) -> Flags:
     """Find the pixels that fulfil Eq. (3)."""
     extremes = np.zeros(after.shape, dtype=np.bool_)
     # A median lies between the minimum and the maximum of its pixels. If a pixel differs from both by less than the
     # limit, it cannot fulfil Eq. (3). Medians are therefore needed only for the few remaining pixels.
     for sign, nearest, farthest in ((1, _maxima, _minima), (-1, _minima, _maxima)):
-        places = np.nonzero(after == nearest(after, 1))
-        limit = EXTREME_SIGMA * noise_after(places)
-        left = sign * (after[places] - farthest(after, 2)[places]) > limit
+        away = sign * (after - farthest(after, 2))
+        # The noise is computed only where the smallest noise of all would not be enough. It is rounded differently: the factor.
+        places = np.nonzero((after == nearest(after, 1)) & (away > 0.999 * EXTREME_SIGMA * noise_after.least))
+        limit = EXTREME_SIGMA * noise_after.at(before[places])
+        left = away[places] > limit
         places, limit = tuple(axis[left] for axis in places), limit[left]
         away_after = sign * (after[places] - _medians(after, places))
         away_before = sign * (before[places] - _medians(before, places))

@@ -17,6 +17,7 @@ bright only because of noise. This hardly matters for blocks of 4 px and more.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -25,6 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.deconvolve.assess import ranks
 from psfcore.deconvolve.assess.artefacts import Artefacts, NoiseAt, find_artefacts
 from psfcore.deconvolve.edges import inside_band
 from psfcore.errors import DataError
@@ -39,6 +41,7 @@ CHANGE_PERCENTILES = (0.1, 1.0, 5.0, 25.0, 50.0, 75.0, 95.0, 99.0, 99.9)
 _LARGEST_PCT = 99.0
 
 Plane = NDArray[np.float64]
+Means = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 
 
@@ -139,15 +142,9 @@ def measure_changes(
         # The filters of the artefact check run at the same time as the percentiles.
         artefacts = beside.submit(check).result if threads > 1 else check
         positive = before > 0
-        # The planes of the percentiles are freed before the next ones are made: here most memory is in use.
         change_pct = _percentiles(_change_pct(*_chosen(positive, before, after))) if positive.any() else {}
         difference = _percentiles(after - before)
-        blocks = [
-            _described(before, after, 1)
-            if block_px == 1
-            else _blocks(image.pixels, result, counted, block_px)
-            for block_px in BLOCKS_PX
-        ]
+        blocks = [_described(before, after, 1), *_larger_blocks(image.pixels, result, counted)]
         structures = tuple(row for part in blocks for row in _structures(part))
         ranges = tuple(row for part in blocks for row in _ranges(part))
     return Changes(
@@ -180,9 +177,8 @@ def block_means(plane: Plane, counted: Flags, block_px: int) -> Plane:
 
     Only blocks whose pixels are all counted are used.
     """
-    if block_px == 1:
-        return np.asarray(plane[counted])
-    return _means(plane, _in_blocks(counted, block_px).all(axis=(1, 3)), block_px)
+    whole = _in_blocks(counted, block_px).all(axis=(1, 3))
+    return np.asarray(_in_blocks(plane, block_px).mean(axis=(1, 3))[whole])
 
 
 def _in_blocks(plane: Any, block_px: int) -> Any:
@@ -191,18 +187,13 @@ def _in_blocks(plane: Any, block_px: int) -> Any:
     return plane[: ny * block_px, : nx * block_px].reshape(ny, block_px, nx, block_px)
 
 
-def _means(plane: Plane, whole: Flags, block_px: int) -> Plane:
-    with np.errstate(invalid="ignore"):  # a block with infinite pixels is not whole
-        return np.asarray(_in_blocks(plane, block_px).mean(axis=(1, 3))[whole])
-
-
 @dataclass(frozen=True, eq=False)
 class _Blocks:
     """Block means (n,) before and after deconvolution, and their lower and upper percentile for each tail."""
 
     block_px: int
-    old: Plane
-    new: Plane
+    old: Means
+    new: Means
     old_levels: dict[float, tuple[float, float]]
     new_levels: dict[float, tuple[float, float]]
 
@@ -212,47 +203,67 @@ class _Blocks:
         return [tail for tail in TAILS_PCT if self.old.size * tail >= 100]
 
 
-def _blocks(before: Plane, after: Plane, counted: Flags, block_px: int) -> _Blocks:
-    """The blocks whose pixels are all counted."""
-    whole = _in_blocks(counted, block_px).all(axis=(1, 3))
-    return _described(_means(before, whole, block_px), _means(after, whole, block_px), block_px)
+def _larger_blocks(before: Plane, after: Plane, counted: Flags) -> Iterator[_Blocks]:
+    """The blocks whose pixels are all counted, for each size of BLOCKS_PX above 1. The sums of a size are those of half the size, added."""
+    block_px = 1
+    while block_px < BLOCKS_PX[-1]:
+        with np.errstate(invalid="ignore"):  # a block with infinite pixels is not whole
+            before, after = _joined(before, np.add), _joined(after, np.add)
+        counted, block_px = _joined(counted, np.logical_and), 2 * block_px
+        if block_px in BLOCKS_PX:
+            yield _described(before[counted] / block_px**2, after[counted] / block_px**2, block_px)
+
+
+def _joined(plane: Any, join: np.ufunc) -> Any:
+    """Each square of 2 x 2 elements joined to one."""
+    ny, nx = plane.shape[0] // 2 * 2, plane.shape[1] // 2 * 2
+    rows = join(plane[0:ny:2], plane[1:ny:2])
+    return join(rows[:, 0:nx:2], rows[:, 1:nx:2])
 
 
 def _described(old: Plane, new: Plane, block_px: int) -> _Blocks:
-    """The blocks with these means (n,)."""
-    return _Blocks(block_px, old, new, _levels(old), _levels(new))
+    """The blocks with these means (n,), in single precision."""
+    before, after = (np.asarray(means, dtype=np.float32) for means in (old, new))
+    return _Blocks(block_px, before, after, _levels(before), _levels(after))
 
 
-def _levels(means: Plane) -> dict[float, tuple[float, float]]:
+def _levels(means: Means) -> dict[float, tuple[float, float]]:
     """For each tail of p percent: (percentile p, percentile 100 - p) of the block means."""
     if means.size == 0:
         return {}
-    percentiles = [level for tail in TAILS_PCT for level in (tail, 100 - tail)]
-    levels = [float(level) for level in np.percentile(means, percentiles)]
+    levels = ranks.percentiles(means, [level for tail in TAILS_PCT for level in (tail, 100 - tail)]).tolist()
     return {tail: (levels[2 * k], levels[2 * k + 1]) for k, tail in enumerate(TAILS_PCT)}
 
 
 def _structures(blocks: _Blocks) -> list[Structure]:
-    rows = (_structure(blocks, kind, tail) for tail in blocks.tails for kind in ("bright", "dark"))
+    if not blocks.tails:
+        return []
+    low, high = blocks.old_levels[max(blocks.tails)]
+    tails = (blocks.old <= low) | (blocks.old >= high)
+    old, new = blocks.old[tails], blocks.new[tails]
+    rows = (_structure(blocks, old, new, kind, tail) for tail in blocks.tails for kind in ("bright", "dark"))
     return [row for row in rows if row is not None]
 
 
-def _structure(blocks: _Blocks, kind: str, tail: float) -> Structure | None:
-    """One row of the table; None if no block of the tail was above zero before deconvolution."""
-    old, new, block_px = blocks.old, blocks.new, blocks.block_px
+def _structure(blocks: _Blocks, old: Means, new: Means, kind: str, tail: float) -> Structure | None:
+    """One row of the table; None if no block of the tail was above zero before deconvolution.
+
+    old, new: means of the brightest and darkest blocks, before and after deconvolution.
+    """
     bright = kind == "bright"
     level = blocks.old_levels[tail][bright]
     chosen = (old >= level if bright else old <= level) & (old > 0)
     if not chosen.any():
         return None
-    change = _change_pct(old[chosen], new[chosen])
+    before, after = old[chosen].astype(np.float64), new[chosen].astype(np.float64)
+    change = _change_pct(before, after)
     return Structure(
         kind=kind,
-        block_px=block_px,
+        block_px=blocks.block_px,
         tail_pct=tail,
-        blocks=int(np.count_nonzero(chosen)),
-        before=float(old[chosen].mean()),
-        sum_pct=float(_change_pct(old[chosen].sum(), new[chosen].sum())),
+        blocks=before.size,
+        before=float(before.mean()),
+        sum_pct=float(_change_pct(before.sum(), after.sum())),
         median_pct=float(np.median(change)),
         up_to_pct=float(np.percentile(change, _LARGEST_PCT if bright else 100 - _LARGEST_PCT)),
     )
@@ -280,14 +291,14 @@ def _dynamic_range(low: float, high: float) -> float | None:
     return float(high / low) if low > 0 else None  # Eq. (2)
 
 
-def _contrast(means: Plane) -> float | None:
+def _contrast(means: Means) -> float | None:
     mean = float(means.mean())
     return float(means.std()) / mean if mean > 0 else None
 
 
 def _percentiles(values: Plane) -> dict[str, float]:
-    """Percentiles of the change. values: they are reordered."""
-    levels = np.percentile(values, CHANGE_PERCENTILES, overwrite_input=True)
+    """Percentiles of the change."""
+    levels = ranks.percentiles(values, CHANGE_PERCENTILES)
     return {f"p{level:g}": float(value) for level, value in zip(CHANGE_PERCENTILES, levels, strict=True)}
 
 
