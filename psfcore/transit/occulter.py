@@ -57,6 +57,8 @@ DOUBT_SIGMAS = 3.0
 UNDESCRIBED = 4.0  # if chi2 per pixel is larger, the simulation does not describe the patch
 DAMPED_FROM = 6  # from this step on each step is halved: steps may oscillate where the scene is faint
 DECONVOLUTION_NOISE = 2.3  # factor by which a deconvolution increases noise, for a core weight of 0.43
+# Least intensity, DN/s: a patch without light has no photon noise, and a noise that was measured can have no read noise.
+LEAST_LEVEL = 1e-6
 _STRIPS = 32
 _DIFFERENCE_PX = 0.05
 
@@ -207,10 +209,9 @@ def _shares(
     chosen: Sequence[int], frames: Sequence[Frame], window: Window, noise: Noise
 ) -> NDArray[np.float64]:
     """The weights of the neighbouring images in their mean. The sum is 1; long exposures have larger weights."""
-    level = np.mean([frames[k].pixels[window].mean(dtype=np.float64) for k in chosen])
-    weight = np.array(
-        [1 / float(noise.variance(np.array(max(level, 0.0)), frames[k].exposure_s)) for k in chosen]
-    )
+    mean = np.mean([frames[k].pixels[window].mean(dtype=np.float64) for k in chosen])
+    level = np.array(max(mean, LEAST_LEVEL))
+    weight = np.array([1 / float(noise.variance(level, frames[k].exposure_s)) for k in chosen])
     return np.asarray(weight / weight.sum())
 
 
@@ -317,7 +318,8 @@ def _ring_mean(frame: Frame, place: Place, window: Window) -> float:
 
 def _level(plane: Plane) -> Plane:
     """The expected intensity: the plane smoothed by a Gaussian with sigma 3 px, at least a twentieth of the mean."""
-    return np.asarray(np.maximum(gaussian_filter(plane, 3.0), 0.05 * max(float(plane.mean()), 0.0)))
+    least = max(0.05 * float(plane.mean()), LEAST_LEVEL)
+    return np.asarray(np.maximum(gaussian_filter(plane, 3.0), least))
 
 
 def _quiet(plane: Plane, noise_per_pixel: float) -> Plane:

@@ -123,6 +123,16 @@ def test_without_noise_places_are_exact() -> None:
     assert np.hypot(*reported.T).max() > 1
 
 
+def test_frames_without_light_and_without_read_noise_have_finite_places() -> None:
+    """A full refit can subtract more light than a frame has."""
+    of = sky()
+    bright = noise_free(of)
+    frames = tuple(dataclasses.replace(f, pixels=f.pixels - f.pixels.max()) for f in bright.frames)
+    dark = dataclasses.replace(bright, frames=frames, noise=Noise(6.0, 0.0))
+    (found,) = found_in(of, dark, [4])
+    assert np.isfinite([found.place.x_px, found.place.y_px, found.depth]).all()
+
+
 def test_errors_on_the_disc_agree_with_the_stated_ones() -> None:
     of, on_disc = sky(), range(4, 8)
     pulls = []
