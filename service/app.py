@@ -11,7 +11,7 @@ import anyio
 from fastapi import FastAPI
 
 from psfcore.fits.viewing.planes import Planes
-from service import api_page, operation
+from service import operation
 from service.api import (
     bulk,
     contexts,
@@ -30,14 +30,11 @@ from service.api import (
 from service.http import guard, observation, problems
 from service.http.rates import AtOnce, Rates
 from service.http.state import Access, State
-from service.pages import assets, login, psf_comparison
+from service.pages import assets, login
 from service.pages import bulk as bulk_pages
 from service.pages import images as image_pages
 from service.pages import jobs as job_pages
-from service.pages import keys as key_pages
-from service.pages import products as product_pages
 from service.pages import psfs as psf_pages
-from service.pages import reports as report_pages
 from service.pages import transits as transit_pages
 from service.pages.rendering import problem_page
 from service.vo import cutouts, interfaces, links, lists
@@ -103,7 +100,7 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
         version=software_version(),
         summary="Point-spread functions of solar EUV telescopes, and deconvolved images.",
         lifespan=lifespan,
-        docs_url=None,  # FastAPI's pages load scripts from other hosts; service.api_page serves a page without them
+        docs_url=None,  # FastAPI's pages load scripts from other hosts; service.pages.assets serves a page without them
         redoc_url=None,
     )
     problems.install(app, problem_page)
@@ -132,28 +129,24 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
         bulk.router,
         events.router,
         keys.router,
+        uws.router,
+        interfaces.router,
+        lists.router,
+        links.router,
+        cutouts.router,
+        operation.router,
+        assets.router,
+        image_pages.router,
+        job_pages.router,
+        image_pages.products,
+        bulk_pages.router,
+        psf_pages.router,
+        transit_pages.router,
+        transit_pages.reports,
+        login.router,
+        login.keys,
     )
-    pages = (
-        uws,
-        interfaces,
-        lists,
-        links,
-        cutouts,
-        operation,
-        api_page,
-        assets,
-        image_pages,
-        job_pages,
-        product_pages,
-        bulk_pages,
-        psf_comparison,
-        psf_pages,
-        transit_pages,
-        report_pages,
-        login,
-        key_pages,
-    )
-    for router in (*routers, *(part.router for part in pages)):
+    for router in routers:
         app.include_router(router)
     return app
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from fastapi.testclient import TestClient
 
-from service.pages.psf_comparison import differences
+from service.pages.psfs import differences
 from service.views import PsfView
 from tests.conftest import write_psf
 from tests.service.conftest import upload
