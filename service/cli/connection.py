@@ -19,7 +19,7 @@ from psfcore.published_psfs import PUBLISHED, kept_file
 from service.cli.fields import options_of
 from service.cli.options import user_errors
 from service.cli.progress import echo, say
-from service.client.address import DEFAULT_SERVER, SHOWN_DIGITS
+from service.client.errors import DEFAULT_SERVER, SHOWN_DIGITS
 from service.client.operations import Operations
 from workers.cache_folder import published_folder
 from workers.contract.requests import FEWEST_DIGITS, Deconvolve

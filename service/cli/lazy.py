@@ -11,8 +11,7 @@ from click.shell_completion import CompletionItem
 
 from psfcore.errors import MissingExtra, missing_extra, module_of_extra
 from service.cli.progress import echo, printable
-from service.client.address import DEFAULT_SERVER, SHOWN_DIGITS
-from service.client.errors import WaitInterrupted
+from service.client.errors import DEFAULT_SERVER, SHOWN_DIGITS, WaitInterrupted
 
 INTERRUPTED = 130  # exit status of a command that was ended by Control-C: 128 + the number of SIGINT
 REJOIN = {"job": "heliopsf job wait {id}", "bulk": "heliopsf bulk status {id} --wait"}
