@@ -13,7 +13,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from service.cli.lazy import Lazy, LazyGroup
+from service.cli.main import Lazy, LazyGroup
 from service.client.errors import WaitInterrupted
 
 # The function that `eval "$(_HELIOPSF_COMPLETE=bash_source heliopsf)"` defines, called as bash does when Tab is pressed.

@@ -11,9 +11,8 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from service.cli.fields import METHODS
-from service.cli.lazy import LazyGroup
-from service.cli.main import main
+from service.cli.main import LazyGroup, main
+from service.cli.options import METHODS
 
 HEAVY = {
     "astropy",

@@ -17,8 +17,8 @@ from fastapi.testclient import TestClient
 
 from psfcore.gap.diagnose import Diagnosis, diagnose
 from psfcore.transit.archive import pack
-from service.cli.gap.diagnose import _lines
 from service.cli.main import main
+from service.cli.transits import _lines
 from tests.gap_files import EDGE_GLOW, GLOW_DN_S, answer_at_once, quick_diagnosis, small_reach, write_gap
 from tests.html_page import check_stands_alone, read_page
 from tests.service.conftest import upload
