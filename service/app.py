@@ -14,15 +14,13 @@ from psfcore.fits.viewing.planes import Planes
 from service import operation
 from service.api import (
     bulk,
-    contexts,
     events,
     images,
     jobs,
     keys,
-    lineage,
     pixels,
     psf_curves,
-    psf_status,
+    psf_versions,
     psfs,
     resumable,
     transits,
@@ -37,7 +35,7 @@ from service.pages import jobs as job_pages
 from service.pages import psfs as psf_pages
 from service.pages import transits as transit_pages
 from service.pages.rendering import problem_page
-from service.vo import cutouts, interfaces, links, lists
+from service.vo import interfaces, links, lists
 from service.vo import jobs as uws
 from workers import traces
 from workers.catalogue.catalogue import Catalogue
@@ -110,11 +108,11 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
     app.state.requests = observation.install(app)
     routers = (
         psfs.choosing,  # before psfs.router, so that "best" is not taken for an id
-        psf_status.router,
-        psf_status.series,
-        contexts.router,
-        psf_status.affected,
-        lineage.router,
+        psf_versions.router,
+        psf_versions.series,
+        psf_versions.contexts,
+        psf_versions.affected,
+        images.lineages,
         images.router,
         transits.router,
         jobs.router,
@@ -133,7 +131,7 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
         interfaces.router,
         lists.router,
         links.router,
-        cutouts.router,
+        links.cutouts,
         operation.router,
         assets.router,
         image_pages.router,

@@ -17,7 +17,7 @@ from pydantic import BaseModel, Field
 
 from psfcore.fits.stored_psf import Cutout, cutout
 from psfcore.tables import lookup as psf_lookup
-from service.http import downloads as files
+from service.http import files
 from service.http.callers import Caller, Reading
 from service.http.problems import RESPONSES, Problem, as_problems
 from service.http.state import Shared, State

@@ -20,12 +20,11 @@ from psfcore.deconvolve.summary import steps_done
 from psfcore.fits.header import read_summary
 from psfcore.instruments.files import telescope_of, telescopes
 from service.api.bulk import LOOK_FROM
-from service.api.images import ImageView, delete_product, upload_image
+from service.api.images import ImageView, delete_product, get_product_lineage, rerun_product, upload_image
 from service.api.jobs import EstimateView, estimate_job, submit_job
-from service.api.lineage import get_product_lineage, rerun_product
 from service.api.pixels import picture_of, prepare_image
-from service.http import downloads
 from service.http.callers import Caller
+from service.http.files import path_of
 from service.http.problems import Problem
 from service.http.quotas import Allowed
 from service.http.state import Shared, State
@@ -345,7 +344,7 @@ def delete(product_id: Identity, caller: PageSubmitting, state: Shared) -> Respo
 def _lost(state: State, digest: str, size: int) -> str | None:
     """Why a file cannot be shown; None if it can."""
     try:
-        downloads.path_of(state.store, digest, size)
+        path_of(state.store, digest, size)
     except Problem as problem:
         return of_problem(problem)
     return None

@@ -16,10 +16,10 @@ from starlette.datastructures import FormData
 from psfcore.errors import DataError
 from psfcore.instruments.files import instrument_names, telescope_of
 from psfcore.tables import lookup
-from service.api.lineage import get_psf_lineage, rerun_psf
+from service.api.images import get_psf_lineage, rerun_psf
 from service.api.pixels import picture_of
 from service.api.psf_curves import tables_of
-from service.api.psf_status import (
+from service.api.psf_versions import (
     SeriesChange,
     SeriesView,
     StatusChange,
@@ -30,8 +30,8 @@ from service.api.psf_status import (
     list_affected_by_psf,
 )
 from service.api.psfs import KindOfUpload, delete_psf, get_psf, list_psfs, psf_filter, upload_psf
-from service.http import downloads
 from service.http.callers import Caller
+from service.http.files import path_of
 from service.http.paging import Cursor, Listing
 from service.http.problems import Problem
 from service.http.state import Shared, State
@@ -303,7 +303,7 @@ def _fit(state: State, view: PsfView) -> dict[str, Any] | None:
     digest = view.details.get("report_sha256")
     if digest is None:
         return None
-    said: dict[str, Any] = json.loads(downloads.path_of(state.store, digest).read_bytes())
+    said: dict[str, Any] = json.loads(path_of(state.store, digest).read_bytes())
     return said
 
 

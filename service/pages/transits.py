@@ -19,7 +19,7 @@ from markupsafe import Markup
 
 from psfcore.transit.manifest import MANIFEST_NAME, parse_manifest
 from service.api.transits import get_transit, list_transits, upload_transit
-from service.http import downloads
+from service.http.files import KEPT, not_modified, path_of
 from service.http.paging import Cursor, Listing
 from service.http.problems import Problem, as_problems
 from service.http.state import Shared, State
@@ -167,8 +167,8 @@ def figure(
             404, "no-such-figure", f"expected a figure from 1 to {len(figures)} of the report; got {number}"
         )
     png = figures[number - 1]
-    headers = {"ETag": f'"{hashlib.sha256(png).hexdigest()}"', "Cache-Control": downloads.KEPT}
-    if (same := downloads.not_modified(request, headers)) is not None:
+    headers = {"ETag": f'"{hashlib.sha256(png).hexdigest()}"', "Cache-Control": KEPT}
+    if (same := not_modified(request, headers)) is not None:
         return same
     return Response(png, media_type="image/png", headers=headers)
 
@@ -178,7 +178,7 @@ def _stored(state: State, row: ReportRow) -> StoredPage | None:
     digest = row.details.get("page_sha256")
     if digest is None:
         return None
-    return read_stored(downloads.path_of(state.store, digest), f"/reports/{row.id}/figures")
+    return read_stored(path_of(state.store, digest), f"/reports/{row.id}/figures")
 
 
 @lru_cache(maxsize=MOST_KEPT)
@@ -202,7 +202,7 @@ def read_stored(path: Path, figures_at: str) -> StoredPage:
 
 
 def _said(state: State, row: ReportRow) -> Mapping[str, Any]:
-    said: dict[str, Any] = json.loads(downloads.path_of(state.store, row.file_sha256, row.bytes).read_bytes())
+    said: dict[str, Any] = json.loads(path_of(state.store, row.file_sha256, row.bytes).read_bytes())
     return said
 
 
