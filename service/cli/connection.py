@@ -80,17 +80,13 @@ class _Server(click.Option):
         return names, f"{text}; --local needs none" if local else text
 
 
-def _remember(context: click.Context, _parameter: click.Parameter, key: str | None) -> None:
-    context.meta[_KEY] = key
-
-
 def server_option(what: str) -> Callable[[Command], Command]:
     """The options ``--server`` and ``--key`` of a command that can send a request to a service."""
     key = click.option(
         "--key",
         envvar="HELIOPSF_KEY",
         expose_value=False,
-        callback=_remember,
+        callback=lambda context, _, key: context.meta.update({_KEY: key}),
         help="Access key. Other users can read command lines, so set HELIOPSF_KEY instead",
     )
     server = click.option(

@@ -268,6 +268,7 @@ DATA = click.option(
 )
 OVERWRITE = click.option("--overwrite", is_flag=True, help="Replace output files that exist")
 
+FITS_ENDS = (".fits", ".fits.gz", ".fts", ".fit")
 NO_KEY = "this service needs a key: set HELIOPSF_KEY to your key (the operator makes keys with `heliopsf key create`)"
 
 
@@ -373,12 +374,12 @@ def fits_files(paths: Sequence[Path]) -> list[Path]:
     """The named files, each once. A folder is replaced by the FITS files in it, sorted by name."""
     files: list[Path] = []
     for path in paths:
-        files += sorted(one for one in path.iterdir() if _is_fits(one)) if path.is_dir() else [path]
+        files += (
+            sorted(one for one in path.iterdir() if one.name.lower().endswith(FITS_ENDS))
+            if path.is_dir()
+            else [path]
+        )
     return list(dict.fromkeys(files))
-
-
-def _is_fits(path: Path) -> bool:
-    return path.name.lower().endswith((".fits", ".fits.gz", ".fts", ".fit"))
 
 
 def counted(number: int, what: str) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import json
 import logging
 from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ from fastapi.responses import FileResponse, Response
 
 from psfcore.fits.header import HeaderSummary, read_summary
 from psfcore.fits.stored_psf import check_is_psf
-from psfcore.transit.archive import START_BYTES, ArchiveContents, archive_kind, could_be_archive, list_archive
+from psfcore.transit.archive import START_BYTES, archive_kind, could_be_archive, list_archive
 from service.client.outputs import base_name
 from service.http.callers import Caller
 from service.http.forms import FORM, FormPart, chunks_of, media_type_of, pieces_of
@@ -76,6 +77,12 @@ def headers_of(content: str) -> dict[str, str]:
 def not_modified(request: Request, headers: dict[str, str]) -> Response | None:
     """The answer 304 if the client already has the content with these headers; otherwise None."""
     return Response(status_code=304, headers=headers) if _client_has(request, headers["ETag"]) else None
+
+
+def json_of(store: Store, digest: str, size: int | None = None) -> dict[str, Any]:
+    """The content of a stored JSON file. Errors and size: as for ``path_of``."""
+    content: dict[str, Any] = json.loads(path_of(store, digest, size).read_bytes())
+    return content
 
 
 def path_of(store: Store, digest: str, size: int | None = None) -> Path:
@@ -217,14 +224,6 @@ class Received:
         return self._digest.hexdigest()
 
 
-def _could_be_fits(start: bytes, _whole: bool) -> bool:
-    return any(start.startswith(beginning[: len(start)]) for beginning in FITS_STARTS)
-
-
-def _image_content(path: Path, state: State) -> HeaderSummary:
-    return read_summary(path, state.limits)
-
-
 def _psf_content(path: Path, state: State) -> HeaderSummary:
     limits = state.settings.psf_limits
     summary = read_summary(path, limits)
@@ -232,13 +231,19 @@ def _psf_content(path: Path, state: State) -> HeaderSummary:
     return summary
 
 
-def _transit_content(path: Path, state: State) -> ArchiveContents:
-    return list_archive(path, state.settings.archive_limits)
-
-
 _FITS = ("a FITS file, which starts with 'SIMPLE  ='", "not-fits")
-_FITS_START = (max(map(len, FITS_STARTS)), _could_be_fits)
-IMAGE = Kind("/v1/images", *_FITS, ImageRow, *_FITS_START, _image_content, image_row)
+_FITS_START = (
+    max(map(len, FITS_STARTS)),
+    lambda start, _whole: any(start.startswith(one[: len(start)]) for one in FITS_STARTS),
+)
+IMAGE = Kind(
+    "/v1/images",
+    *_FITS,
+    ImageRow,
+    *_FITS_START,
+    lambda path, state: read_summary(path, state.limits),
+    image_row,
+)
 PSF = Kind("/v1/psfs", *_FITS, PsfRow, *_FITS_START, _psf_content, uploaded_psf_row, limit="max_psf_bytes")
 TRANSIT = Kind(
     "/v1/transits",
@@ -247,7 +252,7 @@ TRANSIT = Kind(
     TransitRow,
     START_BYTES,
     lambda start, whole: could_be_archive(start) and (not whole or bool(archive_kind(start))),
-    _transit_content,
+    lambda path, state: list_archive(path, state.settings.archive_limits),
     transit_row,
     limit="max_transit_bytes",
 )

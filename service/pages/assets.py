@@ -15,7 +15,7 @@ import hashlib
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
-from importlib.resources.abc import Traversable
+from pathlib import Path
 
 from fastapi import APIRouter, HTTPException, Request, Response
 
@@ -44,8 +44,12 @@ class Asset:
 @cache
 def assets() -> dict[str, Asset]:
     """All files by their names."""
-    found = [one for folder in FOLDERS for one in files(__package__).joinpath(folder).iterdir()]
-    return {one.name: _asset(one) for one in found if _suffix(one) in TYPES}
+    found = [Path(str(one)) for folder in FOLDERS for one in files(__package__).joinpath(folder).iterdir()]
+    plain = {one.name: one.read_bytes() for one in found if one.suffix in TYPES}
+    return {
+        name: Asset(content, gzip.compress(content, mtime=0), TYPES[Path(name).suffix])
+        for name, content in plain.items()
+    }
 
 
 @cache
@@ -74,15 +78,6 @@ def asset(of_version: str, name: str, request: Request) -> Response:
     if "gzip" in request.headers.get("accept-encoding", ""):
         return Response(found.zipped, media_type=found.type, headers={**headers, "Content-Encoding": "gzip"})
     return Response(found.plain, media_type=found.type, headers=headers)
-
-
-def _asset(file: Traversable) -> Asset:
-    plain = file.read_bytes()
-    return Asset(plain, gzip.compress(plain, mtime=0), TYPES[_suffix(file)])
-
-
-def _suffix(file: Traversable) -> str:
-    return "." + file.name.rpartition(".")[2]
 
 
 # --- the reference of the API ---------------------------------------------------------------------------

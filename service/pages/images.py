@@ -304,7 +304,7 @@ def product(product_id: Identity, request: Request, caller: PageReading, state: 
         psf=psf,
         lost=lost,
         image_lost=image_lost,
-        warnings=_warnings(row.details, without=CODE if deprecated else None),
+        warnings=[one["message"] for one in row.details["warnings"] if not deprecated or one["code"] != CODE],
         deprecated=deprecated,
         redo=_again(row, psf_id="" if better is None else better.id),
         changed=_changed(row.details),
@@ -350,11 +350,6 @@ def _lost(state: State, digest: str, size: int) -> str | None:
     return None
 
 
-def _warnings(details: dict[str, Any], *, without: str | None) -> list[str]:
-    """The warnings of a product. without: the code of a warning that the page shows in another way."""
-    return [one["message"] for one in details["warnings"] if one["code"] != without]
-
-
 def _again(row: ProductRow, *, psf_id: str | None = None) -> str:
     """The page of the image, with the options of the product. psf_id: another PSF; empty: the one that the service chooses."""
     other = {} if psf_id is None else {"psf_id": psf_id, "picked_for": None, "psf_recipe": None}
@@ -364,13 +359,13 @@ def _again(row: ProductRow, *, psf_id: str | None = None) -> str:
 def _changed(details: dict[str, Any]) -> list[tuple[str, str]]:
     """What the deconvolution changed in the image, as far as it was measured."""
     shown = {
-        "Total flux": _percent(details["flux_change_pct"]),
-        "Brightest 1 % of the pixels": _percent(details["bright_change_pct"]),
-        "Darkest 1 % of the pixels": _percent(details["dark_change_pct"]),
-        "Noise, compared with the input": _factor(details["noise_amplification"]),
+        "Total flux": _measured(details["flux_change_pct"], "{:+.3g} %"),
+        "Brightest 1 % of the pixels": _measured(details["bright_change_pct"], "{:+.3g} %"),
+        "Darkest 1 % of the pixels": _measured(details["dark_change_pct"], "{:+.3g} %"),
+        "Noise, compared with the input": _measured(details["noise_amplification"], "{:.3g} times"),
         "Chi-squared per pixel": number(details["chi2_per_pixel"]),
-        "Negative pixels": _count(details["negative_pixels"]),
-        "Saturated pixels": _count(details["masked_pixels"]["saturated"]),
+        "Negative pixels": f"{details['negative_pixels']:,}".replace(",", " "),
+        "Saturated pixels": f"{details['masked_pixels']['saturated']:,}".replace(",", " "),
         "Score of artefacts": number(details["changes"]["artefacts"]["score"]),
     }
     return [(name, text) for name, text in shown.items() if text != "-"]
@@ -392,13 +387,5 @@ def _made(details: dict[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
-def _percent(value: float | None) -> str:
-    return "-" if value is None else f"{value:+.3g} %"
-
-
-def _factor(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3g} times"
-
-
-def _count(value: int) -> str:
-    return f"{value:,}".replace(",", " ")
+def _measured(value: float | None, form: str) -> str:
+    return "-" if value is None else form.format(value)

@@ -57,8 +57,11 @@ def install(app: FastAPI) -> None:
     def _login_needed(request: Request, _needed: LoginNeeded) -> Response:
         if request.method not in SAFE_METHODS:
             return RedirectResponse("/login", 303)
-        login = f"/login?{urlencode({'next': _own_address(request)})}"
-        if _came_by_link(request):
+        here = f"{request.url.path}?{request.url.query}" if request.url.query else request.url.path
+        login = f"/login?{urlencode({'next': here})}"
+        # A person followed a link on another site. The browser then withholds the cookie, because it is SameSite=Strict.
+        # Therefore the answer is a page that opens the login page: a second request, which has the cookie.
+        if request.headers.get("sec-fetch-site") == "cross-site":
             return page(request, "login.html", arriving=f"{login}&arrived=true")
         return RedirectResponse(login, 303)
 
@@ -90,19 +93,6 @@ async def _form_token(request: Request) -> str | None:
         return None
     sent = (await request.form()).get("form_token")
     return sent if isinstance(sent, str) else None
-
-
-def _came_by_link(request: Request) -> bool:
-    """Whether a person followed a link on another site. The browser then withholds the cookie, because it is ``SameSite=Strict``.
-
-    Therefore the answer is a page that opens the login page. That second request comes from a page of this service, so
-    it has the cookie.
-    """
-    return request.headers.get("sec-fetch-site") == "cross-site"
-
-
-def _own_address(request: Request) -> str:
-    return f"{request.url.path}?{request.url.query}" if request.url.query else request.url.path
 
 
 # --- login and logout -------------------------------------------------------------------------------------

@@ -158,8 +158,11 @@ def _free_shells(fit: Report) -> list[Plot]:
     free = fit.get("free_shells")
     if free is None:
         return []
-    title, series = "Weight of the scatter without a formula", [_banded("free shells", free["weight"])]
-    return [radial_plot(title, "weight of a pixel", _middles(free["edges_px"]), series)]
+    weight = free["weight"]
+    shells = Series("free shells", weight["median"], weight["minus_1_sigma"], weight["plus_1_sigma"])
+    # The geometric middles of shells; half of the outer edge for a shell from the centre.
+    middles = [sqrt(low * high) if low > 0 else high / 2 for low, high in pairwise(free["edges_px"])]
+    return [radial_plot("Weight of the scatter without a formula", "weight of a pixel", middles, [shells])]
 
 
 def _fit_residuals(fit: Report) -> Plot:
@@ -190,10 +193,6 @@ def band_parameters(report: Report) -> list[Row]:
         )
         for name, limits in report["parameters"].items()
     ]
-
-
-def _banded(label: str, limits: Mapping[str, Numbers]) -> Series:
-    return Series(label, limits["median"], limits["minus_1_sigma"], limits["plus_1_sigma"])
 
 
 # --- a gap ------------------------------------------------------------------------------------------------
@@ -308,11 +307,6 @@ def _flat(made: Report) -> dict[str, str]:
 
 def _image_name(image: Report) -> str:
     return f"{image['file']}, pointing {image['fov']}"
-
-
-def _middles(edges: Sequence[float]) -> list[float]:
-    """The geometric middles of shells; half of the outer edge for a shell from the centre."""
-    return [sqrt(low * high) if low > 0 else high / 2 for low, high in pairwise(edges)]
 
 
 def _figure(value: float | None) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any, get_args
@@ -31,7 +30,7 @@ from service.api.psf_versions import (
 )
 from service.api.psfs import KindOfUpload, delete_psf, get_psf, list_psfs, psf_filter, upload_psf
 from service.http.callers import Caller
-from service.http.files import path_of
+from service.http.files import json_of
 from service.http.paging import Cursor, Listing
 from service.http.problems import Problem
 from service.http.state import Shared, State
@@ -303,8 +302,7 @@ def _fit(state: State, view: PsfView) -> dict[str, Any] | None:
     digest = view.details.get("report_sha256")
     if digest is None:
         return None
-    said: dict[str, Any] = json.loads(path_of(state.store, digest).read_bytes())
-    return said
+    return json_of(state.store, digest)
 
 
 def _rivals(state: State, caller: Caller, view: PsfView) -> list[PsfView]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ from markupsafe import Markup
 
 from psfcore.transit.manifest import MANIFEST_NAME, parse_manifest
 from service.api.transits import get_transit, list_transits, upload_transit
-from service.http.files import KEPT, not_modified, path_of
+from service.http.files import KEPT, json_of, not_modified, path_of
 from service.http.paging import Cursor, Listing
 from service.http.problems import Problem, as_problems
 from service.http.state import Shared, State
@@ -139,7 +138,7 @@ def report(report_id: Identity, request: Request, caller: PageReading, state: Sh
     """The report. It has the same sections as the HTML page that can be downloaded."""
     row = state.row(ReportRow, report_id, caller.owner)
     stored = _stored(state, row)
-    said = _said(state, row)
+    said = json_of(state.store, row.file_sha256, row.bytes)
     view = ReportView.of(row)
     return page(
         request,
@@ -199,11 +198,6 @@ def read_stored(path: Path, figures_at: str) -> StoredPage:
     title, lead, footer = (Markup(html.partition(begin)[2].partition(end)[0]) for begin, end in ends)
     sections = tuple(Markup(one) for one in _SECTION.findall(html))
     return StoredPage(title, lead, footer, sections, tuple(figures))
-
-
-def _said(state: State, row: ReportRow) -> Mapping[str, Any]:
-    said: dict[str, Any] = json.loads(path_of(state.store, row.file_sha256, row.bytes).read_bytes())
-    return said
 
 
 def _tables(kind: str, said: Mapping[str, Any]) -> list[tuple[str, tuple[str, ...], list[plots.Row]]]:

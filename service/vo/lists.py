@@ -191,7 +191,8 @@ def _record(row: ProductRow | PsfRow, kind: str, title: str | None, base: str) -
         "em_xel": 1,
         "pol_xel": 0,
         "obs_title": title,
-        "obs_creation_date": _timestamp(row.created_at),
+        # As DALI writes it, in UTC without a zone, to the millisecond.
+        "obs_creation_date": (iso(round(row.created_at, 3)) or "").removesuffix("Z")[:23],
         "obs_creator_name": row.owner,
         "file_url": f"{base}/v1/{kind}s/{row.id}/file",
         "file_sha256": row.file_sha256,
@@ -253,8 +254,3 @@ def _mjd(date_obs: str | None) -> float | None:
 def _mjd_of(at: float | None) -> float | None:
     """The modified Julian date of a time; None for an open end."""
     return None if at is None or math.isinf(at) else MJD_1970 + at / DAY_S
-
-
-def _timestamp(at: float) -> str:
-    """A time as DALI writes it, in UTC without a zone, to the millisecond."""
-    return (iso(round(at, 3)) or "").removesuffix("Z")[:23]
