@@ -46,9 +46,7 @@ from workers.settings import Settings, software_version
 
 SHORT = re.compile(r"\^\[0-9a-f\]\{(32|64)\}\$")
 PROBLEM = f"#/components/schemas/{problems.ProblemDocument.__name__}"
-CUTOUTS_AT_ONCE = 2
-DECODED_AT_ONCE = 2
-INSPECTED_AT_ONCE = 2
+AT_ONCE = 2  # cut-outs that are made, planes that are decoded, uploads that are inspected
 
 
 def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
@@ -82,9 +80,9 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
             rates,
             streams,
             requests,
-            cutouts=anyio.CapacityLimiter(CUTOUTS_AT_ONCE),
-            decoding=anyio.CapacityLimiter(DECODED_AT_ONCE),
-            inspecting=anyio.CapacityLimiter(INSPECTED_AT_ONCE),
+            cutouts=anyio.CapacityLimiter(AT_ONCE),
+            decoding=anyio.CapacityLimiter(AT_ONCE),
+            inspecting=anyio.CapacityLimiter(AT_ONCE),
             planes=Planes(store.temporary),
         )
         reconciler.start()

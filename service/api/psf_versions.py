@@ -142,14 +142,19 @@ def change_psf_status(psf_id: Identity, body: StatusChange, caller: Certifying, 
 
 
 def _asked(body: StatusChange) -> StatusAsked:
-    ranged = {"valid_from", "valid_to"} & body.model_fields_set
     values = body.model_dump(exclude={"valid_from", "valid_to", "successor", "supersedes"})
     return StatusAsked(
-        validity=Validity.of(body.valid_from, body.valid_to) if ranged else None,
+        validity=_range(body),
         successor_id=body.successor,
         supersedes=tuple(body.supersedes),
         **values,
     )
+
+
+def _range(body: StatusChange | PinAsked) -> Validity | None:
+    """The range of observation times in a request; None if the request names neither of its ends."""
+    named = {"valid_from", "valid_to"} & body.model_fields_set
+    return Validity.of(body.valid_from, body.valid_to) if named else None
 
 
 def _view(state: State, caller: Caller, row: PsfRow) -> StatusView:
@@ -402,7 +407,7 @@ def create_context(body: ContextAsked, response: Response, caller: Certifying, s
     """Pin PSFs under a name: the given PSFs, or all PSFs that are certified now."""
     check_rows(state, caller.owner, 1 + len(body.pins or ()))
     with as_problems():
-        pins = None if body.pins is None else [_pin(pin) for pin in body.pins]
+        pins = None if body.pins is None else [Pin(pin.psf_id, _range(pin)) for pin in body.pins]
         row, new = state.catalogue.contexts.create(
             body.name, caller.owner, caller.name, reason=body.reason, pins=pins
         )
@@ -444,11 +449,6 @@ def get_context(context: IdOrName, caller: Reading, state: Shared) -> WholeConte
     """A context and the PSFs that it pins."""
     with as_problems():
         return _whole(state, state.catalogue.contexts.named(context, caller.owner))
-
-
-def _pin(pin: PinAsked) -> Pin:
-    ranged = {"valid_from", "valid_to"} & pin.model_fields_set
-    return Pin(pin.psf_id, Validity.of(pin.valid_from, pin.valid_to) if ranged else None)
 
 
 def _whole(state: Shared, row: PsfContextRow) -> WholeContext:

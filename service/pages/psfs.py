@@ -341,23 +341,21 @@ def comparison(
 ) -> Response:
     """The two PSFs. Without tables, or with different pixel scales, only their parameters are compared."""
     one, other = get_psf(psf_id, caller, state), get_psf(other_id, caller, state)
-    plots, figures, told = [], None, None
-    try:
-        tables = tables_of(state, caller, psf_id), tables_of(state, caller, other_id)
-        figures = lookup.compare(*tables)
-        plots = _compared_plots(_labels(one, other), *tables)
-    except DataError as error:
-        told = error.message
-    except Problem as problem:
-        if problem.code != "no-tables":
-            raise
-        told = problem.detail
+    labels = _labels(one, other)
+    (first, why), (second, other_why) = (_tables(state, caller, identity) for identity in (psf_id, other_id))
+    plots, figures, told = [], None, why or other_why
+    if first is not None and second is not None:
+        try:
+            figures = lookup.compare(first, second)
+            plots = _compared_plots(labels, first, second)
+        except DataError as error:
+            told = error.message
     return page(
         request,
         "psf_comparison.html",
         one=one,
         other=other,
-        labels=_labels(one, other),
+        labels=labels,
         plots=plots,
         figures=figures,
         told=told,

@@ -118,7 +118,7 @@ def test_what_is_wrong_with_a_report_is_said_in_a_line_and_nothing_is_written(
     subtests: pytest.Subtests, simulated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for arguments, said in (
-        (["-o", "no/such/simulated/R.html"], "there is no simulated"),
+        (["-o", "no/such/folder/R.html"], "there is no folder"),
         (["-o", "R.html", "--psf", "missing.fits"], "expected a PSF id"),
         (["-o", "R.html", "--noise", "-1", "2"], "greater than or equal to 0"),
         (["-o", "R.html", "--seed", "-1"], "not in the range"),
