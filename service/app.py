@@ -11,18 +11,16 @@ import anyio
 from fastapi import FastAPI
 
 from psfcore.fits.viewing.planes import Planes
-from service import api_page, operation
+from service import operation
 from service.api import (
     bulk,
-    contexts,
     events,
     images,
     jobs,
     keys,
-    lineage,
     pixels,
     psf_curves,
-    psf_status,
+    psf_versions,
     psfs,
     resumable,
     transits,
@@ -30,17 +28,14 @@ from service.api import (
 from service.http import guard, observation, problems
 from service.http.rates import AtOnce, Rates
 from service.http.state import Access, State
-from service.pages import assets, login, psf_comparison
+from service.pages import assets, login
 from service.pages import bulk as bulk_pages
 from service.pages import images as image_pages
 from service.pages import jobs as job_pages
-from service.pages import keys as key_pages
-from service.pages import products as product_pages
 from service.pages import psfs as psf_pages
-from service.pages import reports as report_pages
 from service.pages import transits as transit_pages
 from service.pages.rendering import problem_page
-from service.vo import cutouts, interfaces, links, lists
+from service.vo import interfaces, links, lists
 from service.vo import jobs as uws
 from workers import traces
 from workers.catalogue.catalogue import Catalogue
@@ -51,9 +46,7 @@ from workers.settings import Settings, software_version
 
 SHORT = re.compile(r"\^\[0-9a-f\]\{(32|64)\}\$")
 PROBLEM = f"#/components/schemas/{problems.ProblemDocument.__name__}"
-CUTOUTS_AT_ONCE = 2
-DECODED_AT_ONCE = 2
-INSPECTED_AT_ONCE = 2
+AT_ONCE = 2  # cut-outs that are made, planes that are decoded, uploads that are inspected
 
 
 def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
@@ -87,9 +80,9 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
             rates,
             streams,
             requests,
-            cutouts=anyio.CapacityLimiter(CUTOUTS_AT_ONCE),
-            decoding=anyio.CapacityLimiter(DECODED_AT_ONCE),
-            inspecting=anyio.CapacityLimiter(INSPECTED_AT_ONCE),
+            cutouts=anyio.CapacityLimiter(AT_ONCE),
+            decoding=anyio.CapacityLimiter(AT_ONCE),
+            inspecting=anyio.CapacityLimiter(AT_ONCE),
             planes=Planes(store.temporary),
         )
         reconciler.start()
@@ -103,7 +96,7 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
         version=software_version(),
         summary="Point-spread functions of solar EUV telescopes, and deconvolved images.",
         lifespan=lifespan,
-        docs_url=None,  # FastAPI's pages load scripts from other hosts; service.api_page serves a page without them
+        docs_url=None,  # FastAPI's pages load scripts from other hosts; service.pages.assets serves a page without them
         redoc_url=None,
     )
     problems.install(app, problem_page)
@@ -113,11 +106,11 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
     app.state.requests = observation.install(app)
     routers = (
         psfs.choosing,  # before psfs.router, so that "best" is not taken for an id
-        psf_status.router,
-        psf_status.series,
-        contexts.router,
-        psf_status.affected,
-        lineage.router,
+        psf_versions.router,
+        psf_versions.series,
+        psf_versions.contexts,
+        psf_versions.affected,
+        images.lineages,
         images.router,
         transits.router,
         jobs.router,
@@ -132,28 +125,24 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
         bulk.router,
         events.router,
         keys.router,
+        uws.router,
+        interfaces.router,
+        lists.router,
+        links.router,
+        links.cutouts,
+        operation.router,
+        assets.router,
+        image_pages.router,
+        job_pages.router,
+        image_pages.products,
+        bulk_pages.router,
+        psf_pages.router,
+        transit_pages.router,
+        transit_pages.reports,
+        login.router,
+        login.keys,
     )
-    pages = (
-        uws,
-        interfaces,
-        lists,
-        links,
-        cutouts,
-        operation,
-        api_page,
-        assets,
-        image_pages,
-        job_pages,
-        product_pages,
-        bulk_pages,
-        psf_comparison,
-        psf_pages,
-        transit_pages,
-        report_pages,
-        login,
-        key_pages,
-    )
-    for router in (*routers, *(part.router for part in pages)):
+    for router in routers:
         app.include_router(router)
     return app
 

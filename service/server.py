@@ -67,7 +67,7 @@ def serve(
         _allow_open_files()
         # After its shutdown the server raises the signal again. This handler turns the signal into an
         # exception, so that the worker is stopped too.
-        signal.signal(signal.SIGTERM, _raise_exit)
+        signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
         with embedded_worker(settings):
             announce(address)
             try:
@@ -131,10 +131,6 @@ class _Server(uvicorn.Server):
         assert isinstance(self.config.app, FastAPI)
         self.config.app.state.stopping = True
         super().handle_exit(sig, frame)
-
-
-def _raise_exit(_signal: int, _frame: object) -> None:
-    raise SystemExit(0)
 
 
 @contextmanager

@@ -139,7 +139,7 @@ FAULTS = (
           'return min(asked, most or MOST) if asked else most', 'return min(asked, most or MOST) if asked else 0'),
     Fault("cli-saturation-not-passed-on", "service/client/operations.py",
           'if name in Deconvolve.model_fields}', 'if name in Deconvolve.model_fields and name != "saturation_dn"}'),
-    Fault("client-upload-resumes-at-first-byte", "service/client/resumable.py",
+    Fault("client-upload-resumes-at-first-byte", "service/client/connection.py",
           '        file.seek(offset)\n', ''),
     Fault("vo-exposure-added-in-days", "service/vo/lists.py",
           'else start + exposure_s / DAY_S', 'else start + exposure_s'),

@@ -35,7 +35,7 @@ LONGEST_FIRST = (
     "workers/tasks/test_transit_jobs.py",
     "service/pages/browser/test_bulk.py",
     "service/pages/browser/test_product.py",
-    "service/cli/gap/test_diagnose.py",
+    "service/cli/test_transits.py",
     "workers/files/test_collection.py",
     "service/pages/browser/test_way_through.py",
     "workers/run/test_stopping.py",
@@ -47,7 +47,7 @@ TOGETHER = {
     "gap": (
         "tests/psfcore/gap/",
         "tests/workers/tasks/test_gap.py",
-        "tests/service/pages/test_reports.py",
+        "tests/service/pages/test_transits.py",
     ),
     "fits": ("tests/psfcore/scatter/", "tests/psfcore/evaluation/", "tests/psfcore/report/"),
 }

@@ -377,7 +377,8 @@ def get_results(
     row = find(state, caller, bulk_id)
     rows = _in_order(state.catalogue.bulks.progress, row.id, order, limit, warning)
     headers = {"Content-Disposition": f'attachment; filename="bulk-{bulk_id[:12]}.{format}"'}
-    lines, media_type = (_table(rows), CSV) if format == "csv" else (_json_lines(rows), NDJSON)
+    json_lines = ("".join(f"{one.model_dump_json()}\n" for one in batch) for batch in rows)
+    lines, media_type = (_table(rows), CSV) if format == "csv" else (json_lines, NDJSON)
     return StreamingResponse(lines, media_type=media_type, headers=headers)
 
 
@@ -401,11 +402,6 @@ def _in_order(
         results = [one for one in results if warning is None or warning in one.warnings][:left]
         yield results
         left = None if left is None else left - len(results)
-
-
-def _json_lines(batches: Iterator[list[Result]]) -> Iterator[str]:
-    for batch in batches:
-        yield "".join(f"{result.model_dump_json()}\n" for result in batch)
 
 
 def _table(batches: Iterator[list[Result]]) -> Iterator[str]:

@@ -20,7 +20,7 @@ from pydantic import BaseModel, Field
 from psfcore.errors import DataError
 from psfcore.fits.header import all_cards
 from psfcore.fits.viewing.planes import Decoded, Plane, decode_plane
-from service.http import downloads as files
+from service.http import files
 from service.http.callers import Reading
 from service.http.problems import RESPONSES, Problem, as_problems
 from service.http.quotas import check_disk

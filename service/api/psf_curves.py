@@ -5,7 +5,6 @@ A job makes the tables when it builds or fits a PSF. An uploaded PSF has no tabl
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any
 
@@ -17,7 +16,7 @@ from pydantic import BaseModel, Field
 
 from psfcore.fits.stored_psf import Cutout, cutout
 from psfcore.tables import lookup as psf_lookup
-from service.http import downloads as files
+from service.http import files
 from service.http.callers import Caller, Reading
 from service.http.problems import RESPONSES, Problem, as_problems
 from service.http.state import Shared, State
@@ -200,7 +199,7 @@ def _answer(
 
 
 def _read(state: Shared, row: PsfRow, digest: str) -> Mapping[str, Any]:
-    tables: dict[str, Any] = json.loads(files.path_of(state.store, digest).read_bytes())
+    tables = files.json_of(state.store, digest)
     if tables["schema"] != psf_lookup.SCHEMA:
         raise _no_tables(row)
     return tables

@@ -12,8 +12,7 @@ from fastapi import APIRouter, Depends, Query, Request, Response
 from pydantic import BaseModel, Field
 
 from psfcore.errors import DataError
-from service.http import downloads as files
-from service.http import uploads
+from service.http import files
 from service.http.callers import Caller, Reading, Submitting
 from service.http.paging import Page, Paging
 from service.http.problems import RESPONSES, Problem, as_problems, problem
@@ -167,7 +166,7 @@ def _choice(search: Callable[[], Found]) -> Choice:
     "",
     status_code=201,
     summary="Upload a PSF",
-    openapi_extra=uploads.OPENAPI_BODY,
+    openapi_extra=files.OPENAPI_BODY,
     responses={200: {"model": PsfView, "description": "The same file was already uploaded."}},
 )
 async def upload_psf(
@@ -200,7 +199,7 @@ async def upload_psf(
     # Otherwise a PSF that was built here, downloaded and sent again would have a second id.
     equal = None if any(columns.values()) else partial(_made_here, state, caller)
     return PsfView.of(
-        await uploads.add_upload(request, response, caller, state, uploads.PSF, equal=equal, columns=columns)
+        await files.add_upload(request, response, caller, state, files.PSF, equal=equal, columns=columns)
     )
 
 

@@ -21,7 +21,7 @@ from fastapi.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 
 from psfcore.whole_files import sha256_of
-from service.http import uploads
+from service.http import files
 from service.http.callers import Caller, Submitting
 from service.http.problems import RESPONSES, Problem, as_problems
 from service.http.quotas import Allowed, check_length
@@ -38,7 +38,7 @@ ALGORITHMS: dict[str, Callable[[], Any]] = {
     "md5": hashlib.md5,
 }
 PART = "application/offset+octet-stream"
-KINDS: dict[str, uploads.Kind[Any]] = {"transit": uploads.TRANSIT, "image": uploads.IMAGE}
+KINDS: dict[str, files.Kind[Any]] = {"transit": files.TRANSIT, "image": files.IMAGE}
 
 
 def _header(name: str, description: str | None = None, *, required: bool = True) -> dict[str, Any]:
@@ -123,7 +123,7 @@ def begin_upload(request: Request, caller: Submitting, state: Shared) -> Respons
                     return _described(200, open_uploads, equal)
         check_length(state, caller, length)
         with as_problems():
-            filename = uploads.label(metadata.get("filename"))
+            filename = files.label(metadata.get("filename"))
             upload = open_uploads.create(caller.owner, name, length, filename, sha256)
         return _described(201, open_uploads, upload)
 

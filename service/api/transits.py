@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from fastapi import APIRouter, Request, Response
 
-from service.http import downloads as files
-from service.http import uploads
+from service.http import files
 from service.http.callers import Reading, Submitting
 from service.http.paging import Page, Paging
 from service.http.problems import RESPONSES
@@ -26,7 +25,7 @@ reports = APIRouter(prefix="/v1/reports", tags=["reports"], responses=RESPONSES)
     "",
     status_code=201,
     summary="Upload a transit",
-    openapi_extra=uploads.OPENAPI_TRANSIT_BODY,
+    openapi_extra=files.OPENAPI_TRANSIT_BODY,
     responses={200: {"model": TransitDetails, "description": "The same file was already uploaded."}},
 )
 async def upload_transit(
@@ -36,7 +35,7 @@ async def upload_transit(
 
     The table of contents and transit.json are checked at upload. The pixels are read by the jobs that use the transit.
     """
-    return TransitDetails.of(await uploads.add_upload(request, response, caller, state, uploads.TRANSIT))
+    return TransitDetails.of(await files.add_upload(request, response, caller, state, files.TRANSIT))
 
 
 @router.get("", summary="List uploaded transits")

@@ -25,9 +25,8 @@ from service.cli.connection import (
     short,
     whole_id,
 )
-from service.cli.fields import options_of
 from service.cli.jobs import MOST, moment
-from service.cli.options import OUTPUT, fits_files, progress_bar, writes_files
+from service.cli.options import OUTPUT, fits_files, options_of, progress_bar, writes_files
 from service.cli.progress import duration, echo
 from service.client.errors import ServiceError
 from service.client.operations import treatment

@@ -16,10 +16,9 @@ from click.shell_completion import CompletionItem
 from psfcore.errors import did_you_mean
 from psfcore.instruments.files import instrument_names
 from psfcore.published_psfs import PUBLISHED, kept_file
-from service.cli.fields import options_of
-from service.cli.options import user_errors
+from service.cli.options import options_of, user_errors
 from service.cli.progress import echo, say
-from service.client.address import DEFAULT_SERVER, SHOWN_DIGITS
+from service.client.errors import DEFAULT_SERVER, SHOWN_DIGITS
 from service.client.operations import Operations
 from workers.cache_folder import published_folder
 from workers.contract.requests import FEWEST_DIGITS, Deconvolve
@@ -81,17 +80,13 @@ class _Server(click.Option):
         return names, f"{text}; --local needs none" if local else text
 
 
-def _remember(context: click.Context, _parameter: click.Parameter, key: str | None) -> None:
-    context.meta[_KEY] = key
-
-
 def server_option(what: str) -> Callable[[Command], Command]:
     """The options ``--server`` and ``--key`` of a command that can send a request to a service."""
     key = click.option(
         "--key",
         envvar="HELIOPSF_KEY",
         expose_value=False,
-        callback=_remember,
+        callback=lambda context, _, key: context.meta.update({_KEY: key}),
         help="Access key. Other users can read command lines, so set HELIOPSF_KEY instead",
     )
     server = click.option(

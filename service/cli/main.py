@@ -1,15 +1,129 @@
-"""The commands ``heliopsf`` and ``heliopsf psf``: they list all commands, and the file of each command."""
+"""The commands ``heliopsf`` and ``heliopsf psf``: they list all commands, and the file of each command. A command is imported when it
+is called, so that ``heliopsf --version`` is fast.
+"""
 
 from __future__ import annotations
 
-import click
+from collections.abc import Mapping
+from difflib import get_close_matches
+from typing import Any, NamedTuple
 
-from service.cli.lazy import Lazy, LazyGroup
+import click
+from click.shell_completion import CompletionItem
+
+from psfcore.errors import MissingExtra, missing_extra, module_of_extra
+from service.cli.progress import echo, printable
+from service.client.errors import DEFAULT_SERVER, SHOWN_DIGITS, WaitInterrupted
+
+INTERRUPTED = 130  # exit status of a command that was ended by Control-C: 128 + the number of SIGINT
+REJOIN = {"job": "heliopsf job wait {id}", "bulk": "heliopsf bulk status {id} --wait"}
+_FETCH = "                      it prints the command that writes the result, such as heliopsf product get ID -o FILE\n"
+
+
+class Lazy(NamedTuple):
+    """A command that is not imported yet: its module, its name in the module, and the line that ``--help`` shows."""
+
+    module: str
+    name: str
+    summary: str
+
+
+class LazyGroup(click.Group):
+    """Commands under headings. A command's file is imported when the command is called.
+
+    sections: the commands under each heading, by name.
+    """
+
+    def __init__(self, *args: Any, sections: Mapping[str, Mapping[str, Lazy]], **options: Any) -> None:
+        super().__init__(*args, **options)
+        self.sections = sections
+        self.rows = {name: row for rows in sections.values() for name, row in rows.items()}
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Names in the order of the headings."""
+        return list(self.rows)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Import a command; None if the group has no command of this name."""
+        row = self.rows.get(cmd_name)
+        if row is None:
+            return None
+        command: click.Command = getattr(module_of_extra(row.module), row.name)
+        return command
+
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
+        """The commands for tab completion. click's own version would import all of them."""
+        if incomplete.startswith("-"):
+            return super().shell_complete(ctx, incomplete)
+        return [
+            CompletionItem(name, help=row.summary)
+            for name, row in self.rows.items()
+            if name.startswith(incomplete)
+        ]
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """The command that the arguments call. If there is none, the ``UsageError`` names the command that the user may mean."""
+        name = args[0]
+        if name not in self.rows and not name.startswith("-"):
+            close = get_close_matches(name, self.rows, n=1)
+            hint = f" Did you mean `{close[0]}`?" if close else ""
+            ctx.fail(f"there is no command '{name}'.{hint}")
+        return super().resolve_command(ctx, args)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run a command. Control-C ends it with status 130; if its job continues, a message says how to return to the job.
+
+        The message of an error may contain texts of a service or a file; it is made printable. If a package is missing, the
+        message names the extra that installs it.
+        """
+        try:
+            return super().invoke(ctx)
+        except click.ClickException as error:
+            error.message = printable(error.message)  # type: ignore[misc]  # click declares it final
+            raise
+        except ImportError as error:
+            missing = missing_extra(error) if isinstance(error, ModuleNotFoundError) else error
+            if not isinstance(missing, MissingExtra):
+                raise
+            local = "; or add --local, if the command has it" if missing.name == "httpx" else ""
+            raise click.ClickException(f"{missing}{local}") from error
+        except KeyboardInterrupt as stop:
+            echo(_interrupted(stop), err=True)
+            ctx.exit(INTERRUPTED)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the commands under their headings, without importing them."""
+        width = max(map(len, self.rows))
+        for heading, rows in self.sections.items():
+            with formatter.section(heading):
+                formatter.write_dl([(f"{name:<{width}}", row.summary) for name, row in rows.items()])
+
+
+def _interrupted(stop: KeyboardInterrupt) -> str:
+    """What to tell a user who interrupted a command."""
+    if not isinstance(stop, WaitInterrupted):
+        return "interrupted"
+    there = "" if stop.server == DEFAULT_SERVER else f" --server {stop.server}"
+    ids = " ".join(one[:SHOWN_DIGITS] for one in (stop.identity, *stop.others))
+    several = bool(stop.others)
+    rejoin = REJOIN[stop.what].format(id=ids)
+    # The command in ``rejoin`` only waits: it does not know which files the interrupted command would have written.
+    files = "  write the files:    run the same command again; it continues with the same work\n"
+    return (
+        f"interrupted; {f'{stop.what}s {ids} go' if several else f'{stop.what} {ids} goes'} on\n"
+        f"{files if stop.what == 'job' else ''}"
+        f"  wait for {'them' if several else 'it'} again: {rejoin}{there}\n"
+        f"{_FETCH if stop.what == 'job' else ''}"
+        f"  {'cancel them:       ' if several else 'cancel it:        '} heliopsf {stop.what} cancel {ids}{there}"
+    )
+
 
 SECTIONS = {
     "Images": {
         "deconvolve": Lazy("service.cli.deconvolve", "deconvolve", "Deconvolve images."),
-        "changes": Lazy("service.cli.changes", "changes", "Deconvolve images and show what changed."),
+        "changes": Lazy("service.cli.deconvolve", "changes", "Deconvolve images and show what changed."),
         "product": Lazy("service.cli.jobs", "product", "List, download and delete products."),
     },
     "PSFs": {
@@ -17,8 +131,8 @@ SECTIONS = {
         "context": Lazy("service.cli.psf.versions", "context", "Pin sets of PSFs that never change."),
     },
     "Transits": {
-        "report": Lazy("service.cli.report", "report", "Fit a PSF to a transit, or test a PSF on it."),
-        "gap": Lazy("service.cli.gap.diagnose", "gap", "Find why a fitted PSF and a transit differ."),
+        "report": Lazy("service.cli.transits", "report", "Fit a PSF to a transit, or test a PSF on it."),
+        "gap": Lazy("service.cli.transits", "gap", "Find why a fitted PSF and a transit differ."),
         "simulate": Lazy("service.cli.simulate", "simulate", "Simulate transits whose PSF is known."),
     },
     "Archives": {
@@ -38,10 +152,10 @@ SECTIONS = {
         "key": Lazy("service.cli.operator", "key", "Create, list and revoke access keys."),
     },
     "Studies": {
-        "arms": Lazy("service.cli.diffraction", "arms", "Measure the diffraction arms around a flare."),
-        "flare": Lazy("service.cli.flare", "flare", "Test a PSF on the stray light of a flare."),
-        "fresnel": Lazy("service.cli.diffraction", "fresnel", "Test the diffraction by Fresnel propagation."),
-        "design": Lazy("service.cli.diffraction", "design", "Tabulate diffraction for mesh designs."),
+        "arms": Lazy("service.cli.studies", "arms", "Measure the diffraction arms around a flare."),
+        "flare": Lazy("service.cli.studies", "flare", "Test a PSF on the stray light of a flare."),
+        "fresnel": Lazy("service.cli.studies", "fresnel", "Test the diffraction by Fresnel propagation."),
+        "design": Lazy("service.cli.studies", "design", "Tabulate diffraction for mesh designs."),
     },
 }  # fmt: skip
 PSF_SECTIONS = {
@@ -52,8 +166,8 @@ PSF_SECTIONS = {
         "instruments": Lazy("service.cli.psf.versions", "instruments", "List instruments that can be built."),
     },
     "Read": {
-        "published": Lazy("service.cli.psf.published", "list_published", "List PSFs that others published."),
-        "get": Lazy("service.cli.psf.published", "get_psfs", "Bring published PSFs to this machine."),
+        "published": Lazy("service.cli.psf.query", "list_published", "List PSFs that others published."),
+        "get": Lazy("service.cli.psf.query", "get_psfs", "Bring published PSFs to this machine."),
         "show": Lazy("service.cli.psf.make", "show", "Show what a PSF file contains."),
         "query": Lazy("service.cli.psf.query", "query", "Show the light beyond given radii."),
         "cutout": Lazy("service.cli.psf.query", "cutout", "Write the central part of a PSF."),

@@ -19,7 +19,7 @@ from psfcore.fits.header import read_summary
 from psfcore.whole_files import sha256_of
 from service.cli.options import DATA, read_settings, user_errors
 from service.cli.progress import echo
-from service.cli.psf.published import NAMES, SOURCE, brought
+from service.cli.psf.query import NAMES, SOURCE, brought
 from workers import checks
 from workers.catalogue.access import MEANINGS, OWNER, OWNER_RULE, Scope
 from workers.catalogue.catalogue import Catalogue

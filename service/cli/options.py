@@ -1,4 +1,8 @@
-"""Code that commands share: options, settings, errors in one line, output files, and a progress bar.
+"""What commands share: options, settings, errors in one line, and output files.
+
+Most options are made from the fields of the requests: name, type, limits, default and help text. A command names the fields that
+it offers and passes their values on as they are. A new field therefore needs no further declaration:
+`workers.contract.requests` describes it.
 
 This file imports no numerical libraries, so that commands start fast.
 """
@@ -7,31 +11,162 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import wraps
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from types import NoneType, UnionType
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
+import annotated_types
 import click
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
 
 from psfcore.errors import DataError, missing_extra
-from service.cli.fields import options_of
+from psfcore.noise import NoiseFigures
 from service.cli.progress import echo
 from service.cli.progress import progress_bar as progress_bar
 from service.client.errors import ServiceError, error_lines
 from service.client.outputs import base_name, check_output_folder, check_outputs, written
-from workers.contract.requests import Deconvolve
+from workers.contract.requests import METHOD_MODELS, METHODS, Deconvolve, Option, RichardsonLucy
 
 if TYPE_CHECKING:
     from psfcore.fits.blocks import FitsLimits
     from workers.settings import Settings
 
-FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
-FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
+Command = TypeVar("Command", bound=Callable[..., Any])
+_NULL = re.compile(r"; null: (.*?)(?=\. |$)")
+_QUOTED = re.compile(r"`([^`]*)`")
+_FALSE = re.compile(r"; false: .*$")
+
+
+# --- options of the fields of a request -----------------------------------------------------------------
+
+
+def options_of(model: type[BaseModel], *names: str) -> Callable[[Command], Command]:
+    """The options of these fields of a request. "method", "steps" and other parameters of a method are known too.
+
+    A command gets the values by the names of the fields. None: not given, so that the service uses its default.
+    """
+
+    def with_options(command: Command) -> Command:
+        for name in reversed(names):
+            command = _option(model, name)(command)
+        return command
+
+    return with_options
+
+
+def methods_help() -> str:
+    """When to use which method, for the end of a help text."""
+    rows = (
+        f"  {name:<33}{(model.__doc__ or '').split('. ')[0].rstrip('.')}"
+        for name, model in zip(METHODS, METHOD_MODELS, strict=True)
+    )
+    return "\b\nMethods:\n" + "\n".join(rows)
+
+
+def _field(model: type[BaseModel], name: str) -> FieldInfo:
+    return model.model_fields.get(name) or RichardsonLucy.model_fields[name]
+
+
+def _option(model: type[BaseModel], name: str) -> Callable[[Command], Command]:
+    if name == "method":
+        return click.option(
+            "--method",
+            type=click.Choice(METHODS),
+            metavar="NAME",
+            default=METHODS[0],
+            help="Method; `heliopsf deconvolve -h` says which for what",
+        )
+    field = _field(model, name)
+    kind, about, text = _kind(field), _about(field), _help(model, field)
+    names = (_name(model, name), name)
+    if kind is bool:
+        switch = f"{names[0]}/--no-{names[0][2:]}" if field.default else names[0]
+        return click.option(
+            switch, name, is_flag=True, default=bool(field.default), show_default=False, help=text
+        )
+    if kind is NoiseFigures:
+        return click.option("--noise", nargs=2, type=float, metavar="GAIN READ", help=text)
+    # The default of a parameter of a method depends on the method.
+    default = None if name in RichardsonLucy.model_fields else field.default
+    return click.option(
+        *names,
+        type=_type(kind, field),
+        metavar=about.metavar,
+        default=default,
+        show_default=bool(default),
+        callback=None if about.check is None else _checked_by(about.check),
+        help=text,
+    )
+
+
+def _about(field: FieldInfo) -> Option:
+    return next((one for one in field.metadata if isinstance(one, Option)), Option())
+
+
+def _name(model: type[BaseModel], name: str) -> str:
+    """The name of the option of a field."""
+    return _about(_field(model, name)).name or f"--{name.replace('_', '-')}"
+
+
+def _kind(field: FieldInfo) -> Any:
+    """The type of a value that is given."""
+    kind = field.annotation
+    if get_origin(kind) in (Union, UnionType):
+        (kind,) = (one for one in get_args(kind) if one is not NoneType)
+    return get_args(kind)[0] if get_origin(kind) is Annotated else kind
+
+
+def _type(kind: Any, field: FieldInfo) -> click.ParamType:
+    if get_origin(kind) is Literal:
+        return click.Choice([str(one) for one in get_args(kind)])
+    if kind not in (int, float):
+        return click.STRING
+    limits: dict[str, Any] = {}
+    for one in field.metadata:
+        match one:
+            case annotated_types.Ge():
+                limits["min"] = one.ge
+            case annotated_types.Gt():
+                limits |= {"min": one.gt, "min_open": True}
+            case annotated_types.Le():
+                limits["max"] = one.le
+            case annotated_types.Lt():
+                limits |= {"max": one.lt, "max_open": True}
+    return click.IntRange(**limits) if kind is int else click.FloatRange(**limits)
+
+
+def _checked_by(check: Callable[[str], object]) -> Callable[..., str | None]:
+    def checked(context: click.Context, parameter: click.Parameter, text: str | None) -> str | None:
+        if text is not None:
+            try:
+                check(text)
+            except DataError as error:
+                raise click.BadParameter(error.message, context, parameter) from error
+        return text
+
+    return checked
+
+
+def _help(model: type[BaseModel], field: FieldInfo) -> str:
+    """The description of the field with the names of options; what null means is the default."""
+    fields = model.model_fields.keys() | RichardsonLucy.model_fields.keys()
+    text = _FALSE.sub("", field.description or "")
+    begins_with_value = text.startswith("`")
+    text = _QUOTED.sub(lambda word: _name(model, word[1]) if word[1] in fields else word[1], text)
+    default = _NULL.search(text)
+    if default is not None:
+        text = f"{_NULL.sub('', text, count=1)} [default: {default[1]}]"
+    return text if begins_with_value else text[:1].upper() + text[1:]
+
+
+# --- options that commands share ------------------------------------------------------------------------
 
 
 class _Output(click.Path):
@@ -101,6 +236,8 @@ class Place:
         return str(self.path)
 
 
+FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
+FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 OUTPUT = OutputFile(dir_okay=False, path_type=Path)
 DRAWN = DrawnFile(dir_okay=False, path_type=Path)
 OUTPUT_PLACE = OutputPlace()
@@ -131,9 +268,8 @@ DATA = click.option(
 )
 OVERWRITE = click.option("--overwrite", is_flag=True, help="Replace output files that exist")
 
+FITS_ENDS = (".fits", ".fits.gz", ".fts", ".fit")
 NO_KEY = "this service needs a key: set HELIOPSF_KEY to your key (the operator makes keys with `heliopsf key create`)"
-
-Command = TypeVar("Command", bound=Callable[..., Any])
 
 
 @contextmanager
@@ -238,12 +374,12 @@ def fits_files(paths: Sequence[Path]) -> list[Path]:
     """The named files, each once. A folder is replaced by the FITS files in it, sorted by name."""
     files: list[Path] = []
     for path in paths:
-        files += sorted(one for one in path.iterdir() if _is_fits(one)) if path.is_dir() else [path]
+        files += (
+            sorted(one for one in path.iterdir() if one.name.lower().endswith(FITS_ENDS))
+            if path.is_dir()
+            else [path]
+        )
     return list(dict.fromkeys(files))
-
-
-def _is_fits(path: Path) -> bool:
-    return path.name.lower().endswith((".fits", ".fits.gz", ".fts", ".fit"))
 
 
 def counted(number: int, what: str) -> str:

@@ -153,9 +153,6 @@ def bound(folder: Path, json_file: Path | None, overwrite: bool) -> None:
     echo("\n".join(_lines(found)))
 
 
-COMMANDS = (simulate,)
-
-
 def _lines(found: PhotonBound) -> list[str]:
     places = [max(pair) for pair in found.places_px]
     return [

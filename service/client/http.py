@@ -12,10 +12,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from psfcore.errors import DataError
 from psfcore.transit.archive import pack
-from service.client import resumable
-from service.client.address import SHOWN_DIGITS
-from service.client.connection import GOES_ON, Connection
-from service.client.errors import Patience, ServiceError, WaitInterrupted
+from service.client.connection import FROM_BYTES, GOES_ON, Connection, upload_in_parts
+from service.client.errors import SHOWN_DIGITS, Patience, ServiceError, WaitInterrupted
 from service.client.operations import Operations, Progress, without_none
 
 if TYPE_CHECKING:
@@ -47,9 +45,9 @@ class Client(Connection, Operations):
         process ends before, the next upload of the same file continues it, for a day.
         """
         with _as_archive(Path(path)) as archive:
-            if archive.stat().st_size < resumable.FROM_BYTES:
+            if archive.stat().st_size < FROM_BYTES:
                 return self._upload("/v1/transits", archive, media_type="application/octet-stream")
-            return self.get(resumable.upload(self._answer, archive, "transit", archive.name, self.say))
+            return self.get(upload_in_parts(self._answer, archive, "transit", archive.name, self.say))
 
     def upload_psf(
         self,

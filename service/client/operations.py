@@ -130,9 +130,10 @@ class Operations(ABC):
         component: build only this component, such as "diffraction". mask: the mask image (FITS), if the
         mount in the instrument file names one.
         """
-        is_file = isinstance(instrument, Path) or instrument.endswith(".toml")
-        check_outputs((output, preview), inputs=(instrument if is_file else None, mask), overwrite=overwrite)
-        request: dict[str, Any] = {"size": size, "component": component, **named_instrument(instrument)}
+        named = named_instrument(instrument)
+        file = instrument if "instrument_file" in named else None
+        check_outputs((output, preview), inputs=(file, mask), overwrite=overwrite)
+        request: dict[str, Any] = {"size": size, "component": component, **named}
         if mask is not None:
             request["mask_id"] = self.upload_image(mask)["id"]
         psf = self.run("psf-build", request, progress)

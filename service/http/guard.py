@@ -89,7 +89,8 @@ class _Guard:
         The reader of the body gets ``Problem`` 413 at once if the declared length is too large, and as soon as too many
         bytes have arrived.
         """
-        if _may_have_files(path, headers.get("content-type", "")):
+        form = headers.get("content-type", "").lower().startswith(FORM)
+        if UPLOADS.fullmatch(path) or (form and UWS_FORMS.fullmatch(path)):
             return receive
         most, setting = self._settings.max_body_kib * 2**10, "HELIOPSF_MAX_BODY_KIB"
         if path in BULK:
@@ -133,12 +134,6 @@ class _Guard:
                 f"expected a host name of this service; got {sent[:80]!r}: use another address, or add the name to "
                 "HELIOPSF_ALLOWED_HOSTS",
             )
-
-
-def _may_have_files(path: str, content_type: str) -> bool:
-    """Whether the route itself limits the size of a body of this type."""
-    form = content_type.lower().startswith(FORM)
-    return UPLOADS.fullmatch(path) is not None or (form and UWS_FORMS.fullmatch(path) is not None)
 
 
 def check_text(*texts: str) -> None:
@@ -224,13 +219,13 @@ class JsonRequest(Request):
                     "too-many-values",
                     f"expected JSON with at most {most} characters '{sign.decode()}'; got {content.count(sign)}: send less in one request",
                 )
-        return await run_in_threadpool(_parsed, content)
 
+        def parsed() -> Any:
+            value = json.loads(content)
+            check_text(*_texts_in(value))
+            return value
 
-def _parsed(content: bytes) -> Any:
-    value = json.loads(content)
-    check_text(*_texts_in(value))
-    return value
+        return await run_in_threadpool(parsed)
 
 
 def _texts_in(value: Any) -> Iterator[str]:

@@ -5,12 +5,14 @@ The declared lengths of the owner's open resumable uploads count as used.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from service.http.callers import Caller
 from service.http.problems import Problem
+from service.http.rates import Bucket
 from service.http.state import State
 from workers import checks
 from workers.catalogue.catalogue import Row
@@ -39,7 +41,7 @@ class Allowed:
             self._usage = _limited(self._state, self._caller.owner, self._upload_id)
         self._bytes += count
         _check_file(self._state, self._usage, self._bytes)
-        self._state.rates.take_bytes(self._caller.name, count)
+        self._state.rates.take(Bucket.UPLOADS, self._caller.name, math.ceil(count / MIB))
 
     def keep(self, file: Path, digest: str, row: Row) -> tuple[Row, bool]:
         """Store the uploaded file, and add its row to the catalogue; returns the row, and whether it is new.

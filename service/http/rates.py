@@ -26,7 +26,6 @@ from workers.settings import Settings
 
 log = logging.getLogger(__name__)
 WINDOW_S = 60
-MIB = 2**20
 _REDIS = ("redis://", "rediss://")
 _PATIENCE_S = 1.0
 _AWAY_S = 10.0  # time after which a Redis that did not answer is asked again
@@ -108,10 +107,6 @@ class Rates:
                 headers={"Retry-After": str(allowance.reset_s), **allowance.headers},
             )
         return allowance
-
-    def take_bytes(self, who: str, count: int) -> Allowance | None:
-        """The same as ``take``, for uploaded bytes."""
-        return self.take(Bucket.UPLOADS, who, math.ceil(count / MIB))
 
     def _limit_by(self) -> SlidingWindowCounterRateLimiter:
         if self._limiter is None:

@@ -16,7 +16,7 @@ from fastapi import Depends, Request
 
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.viewing.planes import Planes
-from service.client.address import is_loopback
+from service.client.errors import is_loopback
 from service.http.problems import as_problems
 from service.http.rates import AtOnce, Rates
 from workers.catalogue.catalogue import Catalogue, Row

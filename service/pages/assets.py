@@ -2,6 +2,10 @@
 
 VERSION is a hash of all files. Scripts import each other by relative addresses, so a page and its scripts always have
 the same version, and browsers may keep them for ever.
+
+The interactive reference of the API at ``/docs`` is Swagger UI. The package ``fastapi-swagger`` contains its scripts and its
+style sheet. The page of that package starts Swagger UI with an inline script, which our content security policy forbids; the
+page in this module starts it with a script file.
 """
 
 from __future__ import annotations
@@ -11,9 +15,9 @@ import hashlib
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
-from importlib.resources.abc import Traversable
+from pathlib import Path
 
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, HTTPException, Request, Response
 
 from service.http.problems import Problem
 
@@ -25,7 +29,7 @@ TYPES = {
     ".png": "image/png",
 }
 FOR_EVER = "public, max-age=31536000, immutable"
-router = APIRouter(prefix="/static", include_in_schema=False)
+router = APIRouter(include_in_schema=False)
 
 
 @dataclass(frozen=True)
@@ -40,8 +44,12 @@ class Asset:
 @cache
 def assets() -> dict[str, Asset]:
     """All files by their names."""
-    found = [one for folder in FOLDERS for one in files(__package__).joinpath(folder).iterdir()]
-    return {one.name: _asset(one) for one in found if _suffix(one) in TYPES}
+    found = [Path(str(one)) for folder in FOLDERS for one in files(__package__).joinpath(folder).iterdir()]
+    plain = {one.name: one.read_bytes() for one in found if one.suffix in TYPES}
+    return {
+        name: Asset(content, gzip.compress(content, mtime=0), TYPES[Path(name).suffix])
+        for name, content in plain.items()
+    }
 
 
 @cache
@@ -57,7 +65,7 @@ def address(name: str) -> str:
     return f"/static/{version()}/{name}"
 
 
-@router.get("/{of_version}/{name}")
+@router.get("/static/{of_version}/{name}")
 def asset(of_version: str, name: str, request: Request) -> Response:
     """One file. A page of an earlier version gets the present file, which browsers must not keep."""
     found = assets().get(name)
@@ -72,10 +80,69 @@ def asset(of_version: str, name: str, request: Request) -> Response:
     return Response(found.plain, media_type=found.type, headers=headers)
 
 
-def _asset(file: Traversable) -> Asset:
-    plain = file.read_bytes()
-    return Asset(plain, gzip.compress(plain, mtime=0), TYPES[_suffix(file)])
+# --- the reference of the API ---------------------------------------------------------------------------
+
+# Swagger UI loads its icons from data: addresses in its style sheet, and its scripts set styles.
+PAGE_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:; "
+    "connect-src 'self'; frame-ancestors 'none'; base-uri 'none'"
+)
+PAGE = """<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>heliopsf API</title>
+<link rel="icon" href="docs/icon.svg" type="image/svg+xml">
+<link rel="stylesheet" href="docs/swagger-ui.css">
+</head>
+<body>
+<p style="margin: 1rem"><a href="./">Back to heliopsf</a></p>
+<div id="reference"></div>
+<noscript>This page needs JavaScript. The description itself is at <a href="openapi.json">openapi.json</a>.</noscript>
+<script src="docs/swagger-ui-bundle.js"></script>
+<script src="docs/start.js"></script>
+</body>
+</html>
+"""
+# validatorUrl: null keeps Swagger UI from asking another host to validate the description.
+START = """SwaggerUIBundle({
+  url: "openapi.json",
+  dom_id: "#reference",
+  deepLinking: true,
+  docExpansion: "none",
+  validatorUrl: null,
+  presets: [SwaggerUIBundle.presets.apis],
+});
+"""
+OF_REFERENCE = {
+    "swagger-ui-bundle.js": "text/javascript",
+    "swagger-ui.css": "text/css",
+    "start.js": "text/javascript",
+    "icon.svg": "image/svg+xml",
+}
 
 
-def _suffix(file: Traversable) -> str:
-    return "." + file.name.rpartition(".")[2]
+@router.get("/docs")
+def docs() -> Response:
+    """The page."""
+    return Response(
+        PAGE, media_type="text/html; charset=utf-8", headers={"Content-Security-Policy": PAGE_POLICY}
+    )
+
+
+@router.get("/docs/{name}")
+def part(name: str) -> Response:
+    """A script or the style sheet of the page."""
+    if name not in OF_REFERENCE:
+        raise HTTPException(404, f"expected one of {', '.join(OF_REFERENCE)}; got {name!r}")
+    return Response(_content(name), media_type=f"{OF_REFERENCE[name]}; charset=utf-8")
+
+
+@cache
+def _content(name: str) -> bytes:
+    if name == "start.js":
+        return START.encode()
+    if name == "icon.svg":
+        return assets()[name].plain
+    return (files("fastapi_swagger") / "resources" / name).read_bytes()

@@ -13,8 +13,6 @@ from service.api.bulk import (
     LOOK_FROM,
     BulkEstimate,
     BulkId,
-    BulkLine,
-    BulkView,
     Failed,
     Result,
     cancel_bulk,
@@ -77,7 +75,10 @@ def bulk_list(request: Request, caller: PageReading, state: Shared, cursor: Curs
     return page(
         request,
         "bulks.html",
-        runs=[(line, _pace(line, caller, state)) for line in runs.items],
+        # A run that is not LISTING or RUNNING has no speed.
+        runs=[
+            (line, get_bulk(line.id, caller, state) if line.phase in AT_WORK else None) for line in runs.items
+        ],
         next=runs.next,
         first_page=cursor is None,
         images=len(without[:MOST_STARTED]),
@@ -296,11 +297,6 @@ def _reasons(bulk_id: str, caller: Caller, state: State) -> list[dict[str, Any]]
 def _told(failed: BulkItemRow) -> str:
     error = failed.error or {}
     return of_error(error.get("code", ""), error.get("message", ""))
-
-
-def _pace(line: BulkLine, caller: Caller, state: State) -> BulkView | None:
-    """The description of a bulk run with its speed; None for a run that is not LISTING or RUNNING: it has no speed."""
-    return get_bulk(line.id, caller, state) if line.phase in AT_WORK else None
 
 
 def _after(cursor: str | None) -> tuple[float, int] | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from typing import Annotated, Any
 from urllib.parse import urlencode
 
@@ -37,7 +38,7 @@ SentForm = Annotated[Any, Depends(_sent_form)]
 _OPTIONS = ("psf_id", "method", "steps", "error_draws", "photon_gain_dn", "read_noise_dn")
 _BOXES = ("other_channel", "again")
 _ATTRIBUTES = {Ge: ("min", "ge"), Le: ("max", "le"), MultipleOf: ("step", "multiple_of")}
-_REQUEST: TypeAdapter[Any] = TypeAdapter(JobRequest)
+_adapter = cache(TypeAdapter)
 
 
 def text(form: Sent, name: str) -> str:
@@ -89,20 +90,18 @@ def number_field(kind: str, name: str) -> Markup:
     )
 
 
-def checked(model: type[BaseModel], values: Mapping[str, Any]) -> Any:
-    """The model with these values. Raises ``Problem`` 422, which names each wrong field."""
+def checked(model: Any, values: Mapping[str, Any], *, above: int = 0) -> Any:
+    """The model with these values. Raises ``Problem`` 422, which names each wrong field. above: as for ``wrong_fields``."""
     try:
-        return model.model_validate(dict(values))
+        return _adapter(model).validate_python(dict(values))
     except ValidationError as error:
-        raise wrong_fields(error, model) from error
+        raise wrong_fields(error, model, above=above) from error
 
 
 def job_request(kind: str, values: Mapping[str, Any]) -> JobRequest:
     """The request for a job with these parameters. Raises ``Problem`` 422, which names each wrong parameter."""
-    try:
-        request: JobRequest = _REQUEST.validate_python({"kind": kind, "parameters": dict(values)})
-    except ValidationError as error:
-        raise wrong_fields(error, JobRequest, above=len(("kind", "parameters"))) from error
+    body = {"kind": kind, "parameters": dict(values)}
+    request: JobRequest = checked(JobRequest, body, above=len(("kind", "parameters")))
     return request
 
 

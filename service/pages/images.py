@@ -1,4 +1,5 @@
-"""The first page, where an image is dropped; and the page of an image: its header, its PSF, the estimate, and the start of its deconvolution."""
+"""The first page, where an image is dropped; and the page of an image: its header, its PSF, the estimate, and the start of its
+deconvolution; and the page of a product: the viewer, what the deconvolution changed, and how the product was made."""
 
 from __future__ import annotations
 
@@ -13,19 +14,24 @@ from typing import Any
 from fastapi import APIRouter, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import JSONResponse, RedirectResponse
+from starlette.background import BackgroundTasks
 
+from psfcore.deconvolve.summary import steps_done
 from psfcore.fits.header import read_summary
 from psfcore.instruments.files import telescope_of, telescopes
-from service.api.images import ImageView, upload_image
+from service.api.bulk import LOOK_FROM
+from service.api.images import ImageView, delete_product, get_product_lineage, rerun_product, upload_image
 from service.api.jobs import EstimateView, estimate_job, submit_job
-from service.api.pixels import picture_of
+from service.api.pixels import picture_of, prepare_image
 from service.http.callers import Caller
+from service.http.files import path_of
 from service.http.problems import Problem
 from service.http.quotas import Allowed
 from service.http.state import Shared, State
 from service.pages.forms import (
     Sent,
     SentForm,
+    address_of,
     deconvolution,
     image_address,
     shown_options,
@@ -34,13 +40,14 @@ from service.pages.forms import (
 )
 from service.pages.jobs import job_lines
 from service.pages.login import PageReading, PageSubmitting
-from service.pages.rendering import duration, page, short
+from service.pages.rendering import duration, number, page, short
 from service.pages.sentences import draft, of_problem
 from service.views import JobView, ProductView
 from workers.catalogue.psfs import PsfFilter
-from workers.catalogue.tables import ImageRow, JobRow, ProductRow, PsfRow
+from workers.catalogue.tables import ImageRow, JobRow, ProductRow, PsfRow, ReportRow
 from workers.contract.requests import Identity
 from workers.intake.compatibility import suits
+from workers.intake.deprecated import CODE, deprecation
 from workers.intake.psf_choice import ChosenPsf
 from workers.intake.uploads import image_row
 from workers.versions import PsfStatus
@@ -48,12 +55,14 @@ from workers.versions import PsfStatus
 SAMPLE = "sample.fits"
 LATEST = 6
 MOST_PSFS = MOST_PRODUCTS = 50
+MOST_RERUNS = 10
 # Statuses of problems that other options of the form can solve.
 OF_OPTIONS = (404, 409, 413, 422)
 TO_ALLOW = ("channel-mismatch", "already-deconvolved", "psf-as-image")
 SURE = "If you are sure, allow it below."
 START, OPEN, CHECK = "Start", "Open the product", "Check and start"
 router = APIRouter(include_in_schema=False)
+products = APIRouter(prefix="/products/{product_id}", include_in_schema=False)
 
 
 @router.get("/")
@@ -270,3 +279,113 @@ def _facts(row: ImageRow) -> list[tuple[str, str]]:
         "Id": row.id,
     }
     return list(facts.items())
+
+
+# --- a product ------------------------------------------------------------------------------------------
+
+
+@products.get("")
+def product(product_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
+    """The product. If its file or the uploaded image is lost or deleted, the page says so."""
+    row = state.row(ProductRow, product_id, caller.owner)
+    image = state.catalogue.get(ImageRow, row.image_id, row.owner)
+    psf = state.catalogue.get(PsfRow, row.psf_id, row.owner)
+    reruns = state.catalogue.page(ReportRow, owner=row.owner, limit=MOST_RERUNS, about_id=row.id)
+    lost = _lost(state, row.file_sha256, row.bytes)
+    image_lost = None if image is None else _lost(state, image.id, image.bytes)
+    deprecated = None if psf is None else deprecation(state.catalogue, psf)
+    better = None if deprecated is None else deprecated.redo_with
+    answer = page(
+        request,
+        "product.html",
+        product=ProductView.of(row),
+        name=(image and image.filename) or row.details["filename"],
+        image=image,
+        psf=psf,
+        lost=lost,
+        image_lost=image_lost,
+        warnings=[one["message"] for one in row.details["warnings"] if not deprecated or one["code"] != CODE],
+        deprecated=deprecated,
+        redo=_again(row, psf_id="" if better is None else better.id),
+        changed=_changed(row.details),
+        look_at=row.details["changes"]["artefacts"]["score"] >= LOOK_FROM,
+        look_from=LOOK_FROM,
+        again=_again(row),
+        made=_made(row.details),
+        lineage=get_product_lineage(product_id, caller, state),
+        reruns=[one for one in reruns if one.kind == "rerun"],
+    )
+    # The viewer of this page asks for both images as soon as its scripts are loaded.
+    soon = BackgroundTasks()
+    if lost is None:
+        soon.add_task(prepare_image, state, row.file_sha256)
+    if image is not None and image_lost is None:
+        soon.add_task(prepare_image, state, image.id)
+    answer.background = soon
+    return answer
+
+
+@products.post("/rerun")
+def rerun(product_id: Identity, response: Response, caller: PageSubmitting, state: Shared) -> Response:
+    """Make the product again, and go to the job."""
+    job = rerun_product(product_id, response, caller, state)
+    return RedirectResponse(f"/jobs/{job.id}", 303)
+
+
+@products.post("/delete")
+def delete(product_id: Identity, caller: PageSubmitting, state: Shared) -> Response:
+    """Delete the product, and go to the page of its image, or to the first page if the image was deleted."""
+    row = state.row(ProductRow, product_id, caller.owner)
+    delete_product(product_id, caller, state)
+    there = state.catalogue.get(ImageRow, row.image_id, row.owner) is not None
+    return RedirectResponse(f"/images/{row.image_id}" if there else "/", 303)
+
+
+def _lost(state: State, digest: str, size: int) -> str | None:
+    """Why a file cannot be shown; None if it can."""
+    try:
+        path_of(state.store, digest, size)
+    except Problem as problem:
+        return of_problem(problem)
+    return None
+
+
+def _again(row: ProductRow, *, psf_id: str | None = None) -> str:
+    """The page of the image, with the options of the product. psf_id: another PSF; empty: the one that the service chooses."""
+    other = {} if psf_id is None else {"psf_id": psf_id, "picked_for": None, "psf_recipe": None}
+    return address_of({**row.details["parameters"], **other})
+
+
+def _changed(details: dict[str, Any]) -> list[tuple[str, str]]:
+    """What the deconvolution changed in the image, as far as it was measured."""
+    shown = {
+        "Total flux": _measured(details["flux_change_pct"], "{:+.3g} %"),
+        "Brightest 1 % of the pixels": _measured(details["bright_change_pct"], "{:+.3g} %"),
+        "Darkest 1 % of the pixels": _measured(details["dark_change_pct"], "{:+.3g} %"),
+        "Noise, compared with the input": _measured(details["noise_amplification"], "{:.3g} times"),
+        "Chi-squared per pixel": number(details["chi2_per_pixel"]),
+        "Negative pixels": f"{details['negative_pixels']:,}".replace(",", " "),
+        "Saturated pixels": f"{details['masked_pixels']['saturated']:,}".replace(",", " "),
+        "Score of artefacts": number(details["changes"]["artefacts"]["score"]),
+    }
+    return [(name, text) for name, text in shown.items() if text != "-"]
+
+
+def _made(details: dict[str, Any]) -> list[tuple[str, str]]:
+    """How the product was made."""
+    method = details["method"]
+    own = [
+        f"{name} {value}"
+        for name, value in method.items()
+        if value is not None and name not in ("name", "algorithm_version", "steps")
+    ]
+    return [
+        ("Method", f"{method['name']}, {steps_done(details)}"),
+        *([("Options", ", ".join(own))] if own else []),
+        ("Edges", f"{details['edges']}, a band of {details['edge_band_px']} px depends on them"),
+        ("Software", details["software_version"]),
+    ]
+
+
+def _measured(value: float | None, form: str) -> str:
+    return "-" if value is None else form.format(value)

@@ -8,7 +8,6 @@ from typing import Any
 
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import RedirectResponse
-from pydantic import BaseModel
 
 from service.api.jobs import JobId, cancel_job, get_job, list_jobs
 from service.http.callers import Caller
@@ -69,7 +68,7 @@ def job(job_id: JobId, request: Request, caller: PageReading, state: Shared) -> 
         again=_again(view),
         error=None if view.error is None else of_error(view.error.code, view.error.message),
         image=None if image is None else image.id,
-        parameters=_pretty(view),
+        parameters=json.dumps(view.model_dump(mode="json")["parameters"], indent=2),
     )
 
 
@@ -100,8 +99,3 @@ def job_lines(jobs: Sequence[JobView], caller: Caller, state: State) -> list[dic
         }
         for job in jobs
     ]
-
-
-def _pretty(view: BaseModel) -> str:
-    shown: dict[str, Any] = view.model_dump(mode="json")["parameters"]
-    return json.dumps(shown, indent=2)

@@ -1,4 +1,4 @@
-"""Logging in and out with a key, and the visitors of pages.
+"""Logging in and out with a key, the visitors of pages, and the page of keys.
 
 If keys are required, a visitor without a session is sent to the login page, and then back. The routes of pages have a
 parameter ``PageReading``, ``PageSubmitting``, ``PageBulk``, ``PageCertifying`` or ``PageVisiting``. This parameter
@@ -6,6 +6,8 @@ replaces the parameter from ``service.http.callers`` that routes of the API have
 session the visitor is redirected, and the form token may also be a field of the form. The field is read only if no
 header says from which site the request comes. The field is never read from a multipart form, because such a form may
 contain a large file, which only the route may read.
+
+On the page of keys, users list, make and revoke keys. It shows a new key only once.
 """
 
 from __future__ import annotations
@@ -19,23 +21,29 @@ from fastapi import APIRouter, FastAPI, Form, Query, Request, Response, Security
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import RedirectResponse
 from fastapi.security import SecurityScopes
+from pydantic import ValidationError
 
+from service.api.keys import KeyId, MadeKey, NewKey, list_keys, make_key, revoke_key
 from service.http.callers import BEARER, Caller, address_of, admit, cookie_name, names_its_site
 from service.http.forms import media_type_of
 from service.http.guard import SAFE_METHODS
+from service.http.paging import Cursor, Listing
 from service.http.problems import Problem
 from service.http.rates import Bucket
 from service.http.state import Shared, State
 from service.pages.rendering import page
 from service.pages.sentences import of_error
-from workers.catalogue.access import KeyRefused, Scope
+from workers.catalogue.access import LABEL_LENGTH, MEANINGS, OWNER_RULE, KeyRefused, Scope
 
 FORM = "application/x-www-form-urlencoded"
 DAY_S = 86_400
 LONGEST_ADDRESS = 2000  # characters
 ENDED = "Your login has ended. Log in again."
+KEYS_PER_PAGE = 50
+LIFETIMES_DAYS = (7, 30, 90, 365)
 
 router = APIRouter(include_in_schema=False)
+keys = APIRouter(prefix="/keys", include_in_schema=False)
 
 
 class LoginNeeded(Exception):
@@ -49,8 +57,11 @@ def install(app: FastAPI) -> None:
     def _login_needed(request: Request, _needed: LoginNeeded) -> Response:
         if request.method not in SAFE_METHODS:
             return RedirectResponse("/login", 303)
-        login = f"/login?{urlencode({'next': _own_address(request)})}"
-        if _came_by_link(request):
+        here = f"{request.url.path}?{request.url.query}" if request.url.query else request.url.path
+        login = f"/login?{urlencode({'next': here})}"
+        # A person followed a link on another site. The browser then withholds the cookie, because it is SameSite=Strict.
+        # Therefore the answer is a page that opens the login page: a second request, which has the cookie.
+        if request.headers.get("sec-fetch-site") == "cross-site":
             return page(request, "login.html", arriving=f"{login}&arrived=true")
         return RedirectResponse(login, 303)
 
@@ -82,19 +93,6 @@ async def _form_token(request: Request) -> str | None:
         return None
     sent = (await request.form()).get("form_token")
     return sent if isinstance(sent, str) else None
-
-
-def _came_by_link(request: Request) -> bool:
-    """Whether a person followed a link on another site. The browser then withholds the cookie, because it is ``SameSite=Strict``.
-
-    Therefore the answer is a page that opens the login page. That second request comes from a page of this service, so
-    it has the cookie.
-    """
-    return request.headers.get("sec-fetch-site") == "cross-site"
-
-
-def _own_address(request: Request) -> str:
-    return f"{request.url.path}?{request.url.query}" if request.url.query else request.url.path
 
 
 # --- login and logout -------------------------------------------------------------------------------------
@@ -209,3 +207,100 @@ def _set_cookie(request: Request, answer: Response, token: str, lasts_s: int) ->
         httponly=True,
         samesite="strict",
     )
+
+
+# --- keys -----------------------------------------------------------------------------------------------
+
+
+@keys.get("")
+def key_list(
+    request: Request,
+    caller: PageReading,
+    state: Shared,
+    owner: Annotated[str, Query(max_length=64)] = "",
+    cursor: Cursor = None,
+) -> Response:
+    """The keys of the caller. An administrator may name another owner."""
+    if not state.access.keys:
+        return page(request, "keys.html", used=False)
+    return _keys_page(request, caller, state, owner, cursor)
+
+
+@keys.post("")
+def make(
+    request: Request,
+    response: Response,
+    caller: PageSubmitting,
+    state: Shared,
+    scopes: Annotated[list[str] | None, Form()] = None,
+    label: Annotated[str, Form()] = "",
+    lasts_days: Annotated[str, Form()] = "",
+    owner: Annotated[str, Form()] = "",
+) -> Response:
+    """Make a key, and show it."""
+    try:
+        body = NewKey.model_validate(
+            {
+                "scopes": scopes or [],
+                "label": label[:LABEL_LENGTH],
+                "lasts_days": lasts_days or None,
+                "owner": owner or None,
+            }
+        )
+    except ValidationError as error:
+        raise _wrong_form(error) from error
+    made = make_key(body, response, caller, state)
+    return _keys_page(request, caller, state, made.owner, made=made)
+
+
+@keys.post("/{key_id}/revoke")
+def revoke(
+    key_id: KeyId,
+    caller: PageSubmitting,
+    state: Shared,
+    and_made: Annotated[bool, Form()] = False,
+) -> Response:
+    """Revoke a key, and show the list."""
+    row = revoke_key(key_id, caller, state, and_made)
+    return RedirectResponse("/keys" if row.owner == caller.owner else f"/keys?owner={row.owner}", 303)
+
+
+def _keys_page(
+    request: Request,
+    caller: Caller,
+    state: State,
+    owner: str,
+    cursor: str | None = None,
+    made: MadeKey | None = None,
+) -> Response:
+    found = list_keys(Listing(request, KEYS_PER_PAGE, cursor), caller, state, owner or None)
+    admin = Scope.ADMIN in caller.scopes
+    return page(
+        request,
+        "keys.html",
+        status=200 if made is None else 201,
+        used=True,
+        keys=found.items,
+        next=found.next,
+        made=made,
+        owner=owner or caller.owner,
+        admin=admin,
+        may_make=Scope.SUBMIT in caller.scopes,
+        own_id=caller.name,
+        scopes=[(scope, MEANINGS[scope]) for scope in Scope if admin or scope in caller.scopes],
+        chosen=(Scope.READ, Scope.SUBMIT),
+        lifetimes=LIFETIMES_DAYS,
+        label_length=LABEL_LENGTH,
+    )
+
+
+def _wrong_form(error: ValidationError) -> Problem:
+    """The problem that says which fields of the form are wrong, and what to do."""
+    wrong = {str(found["loc"][0]) for found in error.errors() if found["loc"]}
+    advice = {
+        "scopes": "expected at least one scope of the list: go back and choose what the key allows",
+        "lasts_days": "expected a lifetime of the list: go back and choose one",
+        "owner": f"expected an owner of {OWNER_RULE}: go back and correct the name",
+    }
+    said = [text for name, text in advice.items() if name in wrong] or [str(error)]
+    return Problem(422, "invalid-request", "; ".join(said))

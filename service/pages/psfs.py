@@ -1,9 +1,9 @@
-"""The pages of PSFs: the list with its forms, and one PSF with its facts, curves, provenance and status."""
+"""The pages of PSFs: the list with its forms; one PSF with its facts, curves, provenance and status; and two PSFs compared."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping
+import tomllib
+from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any, get_args
 
 from fastapi import APIRouter, Query, Request, Response
@@ -12,12 +12,13 @@ from fastapi.responses import RedirectResponse
 from pydantic import ValidationError, validate_call
 from starlette.datastructures import FormData
 
+from psfcore.errors import DataError
 from psfcore.instruments.files import instrument_names, telescope_of
 from psfcore.tables import lookup
-from service.api.lineage import get_psf_lineage, rerun_psf
+from service.api.images import get_psf_lineage, rerun_psf
 from service.api.pixels import picture_of
 from service.api.psf_curves import tables_of
-from service.api.psf_status import (
+from service.api.psf_versions import (
     SeriesChange,
     SeriesView,
     StatusChange,
@@ -28,16 +29,24 @@ from service.api.psf_status import (
     list_affected_by_psf,
 )
 from service.api.psfs import KindOfUpload, delete_psf, get_psf, list_psfs, psf_filter, upload_psf
-from service.http import downloads
 from service.http.callers import Caller
+from service.http.files import json_of
 from service.http.paging import Cursor, Listing
 from service.http.problems import Problem
 from service.http.state import Shared, State
 from service.pages.forms import SentForm, checked, filled, parameters, start_job, text, wrong_fields
 from service.pages.login import PageCertifying, PageReading, PageSubmitting
-from service.pages.plots import Plot, Series, light_beyond_plot, radial_plot, shown_radii, with_errors
-from service.pages.readings import fit_parameters, fit_plots
-from service.pages.rendering import number, page
+from service.pages.plots import (
+    Plot,
+    Series,
+    fit_parameters,
+    fit_plots,
+    light_beyond_plot,
+    radial_plot,
+    shown_radii,
+    with_errors,
+)
+from service.pages.rendering import number, page, short
 from service.views import PsfView
 from workers.catalogue.access import Scope
 from workers.catalogue.psfs import PsfFilter
@@ -50,6 +59,9 @@ MOST_REPORTS = 10
 CUTOUT_PX = 257
 CORE_PX = 129
 FILTERS = ("instrument", "channel", "kind", "name", "version", "status", "valid_at")
+# Entries of the provenance that say when and where a PSF was made, not how.
+NOT_PARAMETERS = ("psf_id", "job_id", "file", "history", "instrument_toml")
+Tables = Mapping[str, Any]
 router = APIRouter(prefix="/psfs", include_in_schema=False)
 _filter: Callable[..., PsfFilter] = validate_call(psf_filter)
 
@@ -245,7 +257,7 @@ def profile_series(label: str, profile: Mapping[str, Any], name: str, places: li
     return with_errors(label, profile["mean_weight"][name], profile["sigma"].get(name), places)
 
 
-def _tables(state: State, caller: Caller, psf_id: str) -> tuple[Mapping[str, Any] | None, str | None]:
+def _tables(state: State, caller: Caller, psf_id: str) -> tuple[Tables | None, str | None]:
     """Two results: the tables, and None; or None, and the reason why the PSF has no tables."""
     try:
         return tables_of(state, caller, psf_id), None
@@ -255,7 +267,7 @@ def _tables(state: State, caller: Caller, psf_id: str) -> tuple[Mapping[str, Any
         return None, problem.detail
 
 
-def _plots(tables: Mapping[str, Any]) -> list[Plot]:
+def _plots(tables: Tables) -> list[Plot]:
     curve, profile = lookup.curve(tables), lookup.profile(tables)
     sigma = curve["sigma_points"]
     beyond = {name: (pct, sigma.get(name)) for name, pct in curve["light_beyond_pct"].items()}
@@ -290,8 +302,7 @@ def _fit(state: State, view: PsfView) -> dict[str, Any] | None:
     digest = view.details.get("report_sha256")
     if digest is None:
         return None
-    said: dict[str, Any] = json.loads(downloads.path_of(state.store, digest).read_bytes())
-    return said
+    return json_of(state.store, digest)
 
 
 def _rivals(state: State, caller: Caller, view: PsfView) -> list[PsfView]:
@@ -313,3 +324,132 @@ def _change(form: FormData) -> StatusChange:
     values["supersedes"] = [one for one in form.getlist("supersedes") if isinstance(one, str)]
     body: StatusChange = checked(StatusChange, values)
     return body
+
+
+# --- two PSFs compared ----------------------------------------------------------------------------------
+
+
+@router.get("/{psf_id}/vs")
+def choose(psf_id: Identity, other: Identity, caller: PageReading) -> Response:
+    """Go to the comparison with the PSF that was chosen in a form."""
+    return RedirectResponse(f"/psfs/{psf_id}/vs/{other}", 303)
+
+
+@router.get("/{psf_id}/vs/{other_id}")
+def comparison(
+    psf_id: Identity, other_id: Identity, request: Request, caller: PageReading, state: Shared
+) -> Response:
+    """The two PSFs. Without tables, or with different pixel scales, only their parameters are compared."""
+    one, other = get_psf(psf_id, caller, state), get_psf(other_id, caller, state)
+    labels = _labels(one, other)
+    (first, why), (second, other_why) = (_tables(state, caller, identity) for identity in (psf_id, other_id))
+    plots, figures, told = [], None, why or other_why
+    if first is not None and second is not None:
+        try:
+            figures = lookup.compare(first, second)
+            plots = _compared_plots(labels, first, second)
+        except DataError as error:
+            told = error.message
+    return page(
+        request,
+        "psf_comparison.html",
+        one=one,
+        other=other,
+        labels=labels,
+        plots=plots,
+        figures=figures,
+        told=told,
+        differences=differences(one, other),
+    )
+
+
+def differences(one: PsfView, other: PsfView) -> list[tuple[str, str, str]]:
+    """The facts and parameters that differ: name, and the value of each PSF ("-": it has none)."""
+    first, second = _parameters(one), _parameters(other)
+    names = [*first, *(name for name in second if name not in first)]
+    rows = [(name, first.get(name, "-"), second.get(name, "-")) for name in names]
+    return [row for row in rows if row[1] != row[2]]
+
+
+def _labels(one: PsfView, other: PsfView) -> tuple[str, str]:
+    """Short names that tell the two PSFs apart."""
+    first, second = (f"{psf.name} {psf.version}" for psf in (one, other))
+    if first == second:
+        return f"{first} ({short(one.id)})", f"{second} ({short(other.id)})"
+    return first, second
+
+
+def _parameters(psf: PsfView) -> dict[str, str]:
+    facts = {name: said for name, said in psf_facts(psf) if name != "Id"}
+    made = dict(psf.details.get("provenance") or {})
+    fitted = (psf.details.get("fit") or {}).get("parameters") or {}
+    fit = {name: f"{found['value']:.5g} ± {found['sigma']:.2g}" for name, found in fitted.items()}
+    told = {name: value for name, value in made.items() if name not in NOT_PARAMETERS}
+    return {
+        "Name": psf.name,
+        "Version": psf.version,
+        "Status": str(psf.status),
+        **facts,
+        **{f"fit: {name}": said for name, said in fit.items()},
+        **dict(_flat(told)),
+        **{f"instrument file: {name}": said for name, said in _flat(_instrument(made))},
+    }
+
+
+def _instrument(made: Mapping[str, Any]) -> dict[str, Any]:
+    """The content of the instrument file from which a PSF was built; empty if there is none."""
+    text = made.get("instrument_toml")
+    return tomllib.loads(text) if isinstance(text, str) else {}
+
+
+def _flat(values: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str]]:
+    """Nested values as pairs of name and text. The name contains all levels, separated by dots."""
+    for key, value in values.items():
+        name = f"{before}{key}"
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{name}.")
+        elif isinstance(value, list) and value and all(isinstance(item, Mapping) for item in value):
+            for place, item in enumerate(value, start=1):
+                yield from _flat(item, f"{name} {item.get('name', place)}.")
+        elif value is not None:
+            yield name, str(value)
+
+
+def _compared_plots(labels: tuple[str, str], one: Tables, other: Tables) -> list[Plot]:
+    profiles = [lookup.profile(tables) for tables in (one, other)]
+    rings = min(len(profile["radius_px"]) for profile in profiles)
+    places = shown_radii(profiles[0]["radius_px"][:rings])
+    radii = [profiles[0]["radius_px"][at] for at in places]
+    curves = [
+        profile_series(label, profile, lookup.TOTAL, places)
+        for label, profile in zip(labels, profiles, strict=True)
+    ]
+    means = [profile["mean_weight"][lookup.TOTAL] for profile in profiles]
+    ratios = [means[1][at] / means[0][at] if means[0][at] > 0 else None for at in places]
+    title = f"Ratio of the mean weights: {labels[1]} / {labels[0]}"
+    return [
+        radial_plot("Mean weight by radius", "mean weight of a pixel", radii, curves),
+        radial_plot(title, "ratio", radii, [Series("ratio", ratios)], y_log=False),
+        *_light_plots(labels, one, other),
+    ]
+
+
+def _light_plots(labels: tuple[str, str], one: Tables, other: Tables) -> list[Plot]:
+    """The light beyond each radius that both tables have, and the difference."""
+    compared = lookup.compare(one, other)
+    places = shown_radii(compared["radii_px"])
+    radii = [compared["radii_px"][at] for at in places]
+    found = [lookup.curve(tables, radii) for tables in (one, other)]
+    curves = {
+        label: (curve["light_beyond_pct"][lookup.TOTAL], curve["sigma_points"].get(lookup.TOTAL))
+        for label, curve in zip(labels, found, strict=True)
+    }
+    points, sigma = compared["difference_points"][lookup.TOTAL], compared["sigma_points"].get(lookup.TOTAL)
+    difference = radial_plot(
+        f"Difference of the light beyond a radius: {labels[1]} minus {labels[0]}",
+        "percentage points",
+        radii,
+        [with_errors("difference", points, sigma, places)],
+        y_log=False,
+    )
+    return [light_beyond_plot(radii, curves), difference]

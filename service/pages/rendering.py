@@ -2,18 +2,22 @@
 
 A page may load scripts and styles from this service alone, and no script may turn text into markup
 (``require-trusted-types-for``). Therefore templates hold no inline scripts or styles, and scripts build elements.
+
+A file in ``templates`` has the templates of one subject, one after the other. A line ``{# --- NAME --- #}`` begins each of them.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from functools import cache
+from importlib.resources import files
 from typing import Any
 
 from fastapi import Request, Response
 from fastapi.responses import HTMLResponse
-from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+from jinja2 import DictLoader, Environment, StrictUndefined
 from markupsafe import Markup
 
 from service.http.callers import Caller
@@ -58,7 +62,7 @@ def page(
     headers: Mapping[str, str] | None = None,
     **shown: Any,
 ) -> HTMLResponse:
-    """A page. template: its file name. shown: the variables of the template."""
+    """A page. template: its name. shown: the variables of the template."""
     caller: Caller | None = getattr(request.state, "caller", None)
     token: str = getattr(request.state, "form_token", "")
     field = Markup('<input type="hidden" name="form_token" value="{}">').format(token) if token else ""
@@ -86,11 +90,20 @@ def page(
     return HTMLResponse(text, status_code=status, headers=said)
 
 
+def templates() -> dict[str, str]:
+    """The sources of all templates, by their names."""
+    found: dict[str, str] = {}
+    for file in files(__package__).joinpath("templates").iterdir():
+        _, *parts = re.split(r"^\{# --- (\S+) --- #\}\n", file.read_text("utf-8"), flags=re.MULTILINE)
+        found |= zip(parts[::2], map(str.strip, parts[1::2]), strict=True)
+    return found
+
+
 @cache
 def _environment() -> Environment:
     made = Environment(
-        loader=PackageLoader(__package__, "templates"),
-        autoescape=select_autoescape(default=True),
+        loader=DictLoader(templates()),
+        autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,

@@ -16,9 +16,9 @@ from pydantic import AnyUrl
 from service.http.state import Shared
 from service.operation import faults, states
 from service.vo import jobs
-from service.vo.columns import TABLES
 from service.vo.lists import LINKS_STANDARD
 from service.vo.parameters import base_url
+from service.vo.votables import TABLES
 
 MEDIA_TYPE, VERSION = "text/xml", "1.1"
 BASIC = "ivo://ivoa.net/sso#BasicAA"

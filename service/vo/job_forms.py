@@ -22,13 +22,12 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails, from_json
 
 from psfcore.errors import DataError
-from service.http import uploads
 from service.http.callers import Caller, Submitting
+from service.http.files import IMAGE, PSF, TRANSIT, Kind, Received, label
 from service.http.forms import FORM, FormPart, Piece, media_type_of
 from service.http.problems import Problem
 from service.http.quotas import Allowed, check_room
 from service.http.state import Shared, State
-from service.http.uploads import Received
 from service.vo.parameters import (
     MAX_FORM_BYTES,
     NO_XML,
@@ -46,11 +45,11 @@ from workers.intake.requests import resolve
 
 # The names in UPLOAD, and for each name the parameter that gets the id of the file.
 NAMES = {"image": "image_id", "mask": "mask_id", "transit": "transit_id", "psf": "psf_id"}
-KINDS_OF: dict[str, uploads.Kind[Any]] = {
-    "image": uploads.IMAGE,
-    "mask": uploads.IMAGE,
-    "transit": uploads.TRANSIT,
-    "psf": uploads.PSF,
+KINDS_OF: dict[str, Kind[Any]] = {
+    "image": IMAGE,
+    "mask": IMAGE,
+    "transit": TRANSIT,
+    "psf": PSF,
 }
 INLINE = "param:"
 MOST_FILES = len(NAMES)
@@ -220,7 +219,7 @@ def keep(state: State, caller: Caller, files: Mapping[str, Received]) -> None:
         kind = KINDS_OF[name]
         kind.check_size(file.bytes, state)
         summary = kind.inspect(file.path, state)
-        rows.append(kind.row(caller.owner, file.sha256, file.bytes, uploads.label(file.filename), summary))
+        rows.append(kind.row(caller.owner, file.sha256, file.bytes, label(file.filename), summary))
     allowed = Allowed(state, caller)  # the bytes were counted against the caller's rate when they arrived
     for file, row in zip(files.values(), rows, strict=True):
         allowed.keep(file.path, file.sha256, row)

@@ -23,7 +23,6 @@ from service.http.callers import Caller, Reading
 from service.http.paging import Listing
 from service.http.problems import Problem
 from service.http.state import Shared, State
-from service.vo.columns import PRODUCTS, PSFS, Table
 from service.vo.parameters import (
     JSON,
     JSON_TYPE,
@@ -37,6 +36,7 @@ from service.vo.parameters import (
     one,
     query,
 )
+from service.vo.votables import PRODUCTS, PSFS, Input, Service, Table, error_document, table_document
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow
 from workers.lineage import NAMES
 from workers.versions import iso, seconds
@@ -57,14 +57,8 @@ class VotableErrors(PlainErrors):
 
     async def error(self, problem: Problem) -> Response:
         """The answer that reports an error."""
-        content = await run_in_threadpool(_error_document, problem.detail)
+        content = await run_in_threadpool(error_document, problem.detail)
         return Response(content, problem.status, headers=problem.headers, media_type=VOTABLE_TYPE)
-
-
-def _error_document(message: str) -> bytes:
-    from service.vo.votables import error_document  # loads the numerical libraries
-
-    return error_document(message)
 
 
 VOTABLE_ERROR: dict[int | str, dict[str, Any]] = {
@@ -197,7 +191,8 @@ def _record(row: ProductRow | PsfRow, kind: str, title: str | None, base: str) -
         "em_xel": 1,
         "pol_xel": 0,
         "obs_title": title,
-        "obs_creation_date": _timestamp(row.created_at),
+        # As DALI writes it, in UTC without a zone, to the millisecond.
+        "obs_creation_date": (iso(round(row.created_at, 3)) or "").removesuffix("Z")[:23],
         "obs_creator_name": row.owner,
         "file_url": f"{base}/v1/{kind}s/{row.id}/file",
         "file_sha256": row.file_sha256,
@@ -227,8 +222,6 @@ def _listed(
         cells = [{column.name: row.get(column.name) for column in table.columns} for row in records(rows)]
         document = {"table": table.name, "columns": columns, "rows": cells}
         return JSONResponse(document | {"status": status, "next": following_page})
-    from service.vo.votables import Input, Service, table_document  # loads the numerical libraries
-
     links = Service(
         "links",
         "All files of a row",
@@ -261,8 +254,3 @@ def _mjd(date_obs: str | None) -> float | None:
 def _mjd_of(at: float | None) -> float | None:
     """The modified Julian date of a time; None for an open end."""
     return None if at is None or math.isinf(at) else MJD_1970 + at / DAY_S
-
-
-def _timestamp(at: float) -> str:
-    """A time as DALI writes it, in UTC without a zone, to the millisecond."""
-    return (iso(round(at, 3)) or "").removesuffix("Z")[:23]

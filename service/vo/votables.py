@@ -1,6 +1,10 @@
-"""Writes VOTables (IVOA VOTable 1.4, 21 October 2019) with ``astropy.io.votable``.
+"""VOTables (IVOA VOTable 1.4, 21 October 2019): the columns of the lists of products and PSFs and of DataLink tables, and their
+documents, which ``astropy.io.votable`` writes.
 
-This module loads the numerical libraries, so the service imports it for the first request that needs it.
+Citation: IVOA ObsCore 1.1 (9 May 2017), tables 6 and 7; IVOA DataLink 1.1 (15 December 2023), section 3.2. Every list has the
+columns of ObsCore that are mandatory, in the same order, so that a catalogue can ingest it; columns of this service follow. A
+value is null if the service does not know it. The position on the sky is always null: ObsCore gives it in
+equatorial coordinates, and the Sun moves in them.
 """
 
 from __future__ import annotations
@@ -8,15 +12,135 @@ from __future__ import annotations
 import io
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from astropy.io.votable import tree
-
-from service.vo.columns import Column
 from service.vo.parameters import NO_XML
 from workers.settings import software_version
 
+if TYPE_CHECKING:
+    from astropy.io.votable import tree
+
 VERSION = "1.4"
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table: its VOTable type, its meaning, and its names in the models of the IVOA."""
+
+    name: str
+    description: str
+    datatype: str = "char"
+    unit: str | None = None
+    ucd: str | None = None
+    utype: str | None = None
+    xtype: str | None = None
+
+    @property
+    def arraysize(self) -> str | None:
+        """The length of the value: any length for a text."""
+        return "*" if self.datatype == "char" else None
+
+
+@dataclass(frozen=True)
+class Table:
+    """A list of the service."""
+
+    name: str
+    description: str
+    columns: tuple[Column, ...]
+
+
+def _obscore(
+    name: str, utype: str, ucd: str, description: str, datatype: str = "char", unit: str | None = None, xtype: str | None = None
+) -> Column:  # fmt: skip
+    return Column(name, description, datatype, unit, ucd, f"obscore:{utype}", xtype)
+
+
+OBSCORE = (
+    _obscore("dataproduct_type", "ObsDataset.dataProductType", "meta.code.class", "Type of the data: image"),
+    _obscore("calib_level", "ObsDataset.calibLevel", "meta.code;obs.calib", "Level of the calibration; 3: a derived product", "int"),
+    _obscore("obs_collection", "DataID.collection", "meta.id", "Collection to which the data belong"),
+    _obscore("obs_id", "DataID.observationID", "meta.id", "Id of the observation: the SHA-256 of the input image; for a PSF its id"),
+    _obscore("obs_publisher_did", "Curation.publisherDID", "meta.ref.ivoid", "Id of the product or PSF for /vo/links and /vo/cutout"),
+    _obscore("access_url", "Access.reference", "meta.ref.url", "Address of the DataLink table with all files of the product or PSF"),
+    _obscore("access_format", "Access.format", "meta.code.mime", "Media type at access_url"),
+    _obscore("access_estsize", "Access.size", "phys.size;meta.file", "Size of the FITS file", "long", "kbyte"),
+    _obscore("target_name", "Target.name", "meta.id;src", "Observed object"),
+    _obscore("s_ra", "Char.SpatialAxis.Coverage.Location.Coord.Position2D.Value2.C1", "pos.eq.ra", "Right ascension; null", "double", "deg"),
+    _obscore("s_dec", "Char.SpatialAxis.Coverage.Location.Coord.Position2D.Value2.C2", "pos.eq.dec", "Declination; null", "double", "deg"),
+    _obscore("s_fov", "Char.SpatialAxis.Coverage.Bounds.Extent.diameter", "phys.angSize;instr.fov", "Width or height of the field of view, whichever is larger", "double", "deg"),
+    _obscore("s_region", "Char.SpatialAxis.Coverage.Support.Area", "pos.outline;obs.field", "Region on the sky; null"),
+    _obscore("s_resolution", "Char.SpatialAxis.Resolution.Refval.value", "pos.angResolution", "Angular resolution; null", "double", "arcsec"),
+    _obscore("s_xel1", "Char.SpatialAxis.numBins1", "meta.number", "Number of columns", "long"),
+    _obscore("s_xel2", "Char.SpatialAxis.numBins2", "meta.number", "Number of rows", "long"),
+    _obscore("t_min", "Char.TimeAxis.Coverage.Bounds.Limits.StartTime", "time.start;obs.exposure", "Start of the exposure (MJD); for a PSF start of its validity", "double", "d"),
+    _obscore("t_max", "Char.TimeAxis.Coverage.Bounds.Limits.StopTime", "time.end;obs.exposure", "End of the exposure (MJD); for a PSF end of its validity", "double", "d"),
+    _obscore("t_exptime", "Char.TimeAxis.Coverage.Support.Extent", "time.duration;obs.exposure", "Exposure time", "double", "s"),
+    _obscore("t_resolution", "Char.TimeAxis.Resolution.Refval.value", "time.resolution", "Resolution in time: the exposure time", "double", "s"),
+    _obscore("t_xel", "Char.TimeAxis.numBins", "meta.number", "Number of times", "long"),
+    _obscore("em_min", "Char.SpectralAxis.Coverage.Bounds.Limits.LoLimit", "em.wl;stat.min", "Wavelength that names the channel", "double", "m"),
+    _obscore("em_max", "Char.SpectralAxis.Coverage.Bounds.Limits.HiLimit", "em.wl;stat.max", "Wavelength that names the channel", "double", "m"),
+    _obscore("em_res_power", "Char.SpectralAxis.Resolution.ResolPower.refVal", "spect.resolution", "Spectral resolving power; null", "double"),
+    _obscore("em_xel", "Char.SpectralAxis.numBins", "meta.number", "Number of wavelengths", "long"),
+    _obscore("o_ucd", "Char.ObservableAxis.ucd", "meta.ucd", "UCD of the pixels"),
+    _obscore("pol_states", "Char.PolarizationAxis.stateList", "meta.code;phys.polarization", "Polarization states; null"),
+    _obscore("pol_xel", "Char.PolarizationAxis.numBins", "meta.number", "Number of polarization states", "long"),
+    _obscore("facility_name", "Provenance.ObsConfig.Facility.name", "meta.id;instr.tel", "Observatory or spacecraft"),
+    _obscore("instrument_name", "Provenance.ObsConfig.Instrument.name", "meta.id;instr", "Instrument"),
+    _obscore("obs_title", "DataID.title", "meta.title;obs", "Title"),
+    _obscore("obs_creation_date", "DataID.date", "time.creation;meta.dataset", "Time at which the product or PSF was made", xtype="timestamp"),
+    _obscore("obs_creator_name", "DataID.creator", "meta.id", "Owner"),
+)  # fmt: skip
+_FILE = (
+    Column("file_url", "Address of the FITS file", ucd="meta.ref.url;meta.fits"),
+    Column("file_sha256", "SHA-256 of the FITS file", ucd="meta.checksum"),
+    Column("provenance_url", "Address of the lineage as W3C PROV-JSON", ucd="meta.ref.url"),
+)
+PRODUCTS = Table(
+    "products",
+    "Products: deconvolved images",
+    (
+        *OBSCORE,
+        *_FILE,
+        Column("image_id", "SHA-256 of the input image", ucd="meta.id"),
+        Column("psf_id", "Id of the PSF", ucd="meta.id;instr.det.psf"),
+        Column("psf_version", "Version of the PSF", ucd="meta.version"),
+        Column("method", "Method of the deconvolution", ucd="meta.id"),
+        Column("artefact_score", "Artefact score: large where a product shows signs of over-deconvolution", "double", ucd="stat.value"),
+    ),
+)  # fmt: skip
+PSFS = Table(
+    "psfs",
+    "PSFs: point-spread functions of instruments",
+    (
+        *OBSCORE,
+        *_FILE,
+        Column("name", "Name of the PSF", ucd="meta.id;meta.main"),
+        Column("version", "Version of the PSF in its series", ucd="meta.version"),
+        Column("status", "draft, certified or deprecated", ucd="meta.code.status"),
+        Column("kind", "total, a component such as diffraction, or uploaded", ucd="meta.code.class"),
+        Column("origin", "built, fitted, interpolated or uploaded", ucd="meta.code.class"),
+        Column("successor", "Id of the PSF to use instead of a deprecated PSF", ucd="meta.id"),
+    ),
+)
+TABLES = (PRODUCTS, PSFS)
+LINKS = (
+    Column("ID", "Id of the product or PSF, as the request gives it", ucd="meta.id;meta.main"),
+    Column("access_url", "Address", ucd="meta.ref.url"),
+    Column("service_def", "ID of the description of the service, below", ucd="meta.ref"),
+    Column("error_message", "Why there is no link", ucd="meta.code.error"),
+    Column(
+        "semantics", "Meaning of the link: a term of http://www.ivoa.net/rdf/datalink/core", ucd="meta.code"
+    ),
+    Column("description", "Description", ucd="meta.note"),
+    Column("content_type", "Media type", ucd="meta.code.mime"),
+    Column("content_length", "Size", "long", unit="byte", ucd="phys.size;meta.file"),
+    Column("local_semantics", "Name of the link in this service", ucd="meta.code"),
+    Column("link_auth", "Whether the address needs a key", ucd="meta.code"),
+)
+
+
+# --- VOTables -------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -60,6 +184,8 @@ def table_document(
 
     status: QUERY_STATUS, "OK" or "OVERFLOW". infos: further INFO elements.
     """
+    from astropy.io.votable import tree
+
     votable = tree.VOTableFile(version=VERSION)
     results = tree.Resource(type="results")
     votable.resources.append(results)
@@ -81,6 +207,8 @@ def table_document(
 
 def error_document(message: str) -> bytes:
     """A VOTable that reports an error (DALI 1.1, section 4.4.1)."""
+    from astropy.io.votable import tree
+
     votable = tree.VOTableFile(version=VERSION)
     results = tree.Resource(type="results")
     votable.resources.append(results)
@@ -90,6 +218,8 @@ def error_document(message: str) -> bytes:
 
 
 def _field(votable: tree.VOTableFile, column: Column) -> tree.Field:
+    from astropy.io.votable import tree
+
     field = tree.Field(
         votable,
         ID=column.name,
@@ -113,6 +243,8 @@ def _stored(column: Column, value: Any) -> Any:
 
 
 def _described(votable: tree.VOTableFile, service: Service) -> tree.Resource:
+    from astropy.io.votable import tree
+
     described = tree.Resource(ID=service.id, type="meta", utype="adhoc:service")
     described.description = service.description
     texts = {
@@ -134,6 +266,8 @@ def _described(votable: tree.VOTableFile, service: Service) -> tree.Resource:
 
 
 def _parameter(votable: tree.VOTableFile, service_id: str, one: Input) -> tree.Param:
+    from astropy.io.votable import tree
+
     parameter = tree.Param(
         votable,
         ID=f"{service_id}-{one.name}",  # otherwise astropy writes the name, which may be the ID of a column

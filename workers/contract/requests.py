@@ -29,7 +29,7 @@ PRINTABLE, PRINTABLE_OR_EMPTY = r"^[^\x00-\x1f\x7f]+$", r"^[^\x00-\x1f\x7f]*$"
 
 @dataclass(frozen=True)
 class Option:
-    """How a command names a field of a request, as metadata of its annotation; `service.cli.fields` makes the option.
+    """How a command names a field of a request, as metadata of its annotation; `service.cli.options` makes the option.
 
     name: such as "--saturation"; None: the name of the field. metavar: the placeholder of the value. check: raises DataError
     for a text that is no value.

@@ -11,12 +11,12 @@ from typing import Any
 import click
 
 from service.cli.connection import LOCAL, SERVER, connection, short
-from service.cli.fields import options_of
 from service.cli.options import (
     FILE,
     JSON,
     OUTPUT,
     PLOT,
+    options_of,
     progress_bar,
     psf_limits,
     user_errors,

@@ -1,4 +1,5 @@
-"""Commands about PSFs in files or on a service (``psf query``, ``cutout``, ``rebin``), and the built PSFs that are kept (``cache``).
+"""Commands that read PSFs: those that others published (``psf published``, ``psf get``), those in files or on a service (``psf query``,
+``cutout``, ``rebin``), and the built PSFs that are kept (``cache``).
 
 For a file the tables are computed in this process; for an id the service reads its stored tables. Both give the same answers.
 """
@@ -15,19 +16,81 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from psfcore.psf_cache import PROVENANCE, CachedPsf, PsfCache
+from psfcore.published_psfs import PUBLISHED, get, published
 from psfcore.tables import lookup
 from service.cli.connection import ID_OR_FILE, SERVER_FOR_IDS, is_psf_id, psf_file, remote, short, whole_id
-from service.cli.options import JSON, OUTPUT, psf_limits, user_errors, write_json, writes_files
+from service.cli.options import (
+    FOLDER,
+    JSON,
+    OUTPUT,
+    progress_bar,
+    psf_limits,
+    user_errors,
+    write_json,
+    writes_files,
+)
 from service.cli.progress import echo
 from service.client.outputs import written
-from workers.cache_folder import psf_cache
+from workers.cache_folder import psf_cache, published_folder
 
 if TYPE_CHECKING:
     from psfcore.psf import Psf
-
 _MIB = 2**20
 PSF = click.argument("psf", type=ID_OR_FILE, metavar="ID|FILE")
 SHOWN_RADII_PX = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+NAMES = click.argument("names", metavar="NAME...", nargs=-1, required=True)
+SOURCE = click.option(
+    "--from",
+    "source",
+    type=FOLDER,
+    help="Folder with the published files, for machines without internet [default: download them]",
+)
+
+
+# --- published PSFs -------------------------------------------------------------------------------------
+
+
+@click.command("published")
+def list_published() -> None:
+    """List published PSFs: name, telescope, channel, size, contents, and the publication to cite.
+
+    A * marks those that `heliopsf psf get` brought to this machine.
+    """
+    for one in PUBLISHED.values():
+        there = "*" if (published_folder() / f"{one.name}.fits").is_file() else " "
+        size = f"{one.size_px} px" + (f", {one.file_mib} MiB" if one.file_mib else "")
+        echo(
+            f"{there} {one.name:<16} {one.telescope:<13} {one.channel:<6}  {size:<16} {one.contains}\n"
+            f"    {one.citation}; DOI {one.doi or 'unknown'}"
+            + ("" if one.addresses else f"; no public address, get {one.file} from {one.place}")
+        )
+
+
+@click.command("get")
+@NAMES
+@SOURCE
+def get_psfs(names: tuple[str, ...], source: Path | None) -> None:
+    """Bring published PSFs, whose names then stand for them: `heliopsf deconvolve --psf NAME`.
+
+    A broken download is tried again. The SHA-256 of the file is recorded at the first time and compared afterwards.
+    HELIOPSF_CACHE_DIR names the folder that keeps them; several machines may share it.
+    """
+    for name in names:
+        brought(name, source)
+        echo(f"next: `heliopsf deconvolve IMAGE --psf {name} --local -o PRODUCT.fits`")
+
+
+def brought(name: str, source: Path | None) -> Path:
+    """The file of a published PSF, which is brought first if it is not there; says where it is and how to cite it."""
+    with user_errors(), progress_bar() as report:
+        file = get(published_folder(), name, source=source, progress=report)
+    one = published(name)
+    echo(f"{file}: PSF {one.name}, {one.telescope} {one.channel}")
+    echo(f"  cite {one.citation}" + ("" if one.doi is None else f"; doi:{one.doi}"))
+    return file
+
+
+# --- PSFs in files or on a service -----------------------------------------------------------------------
 
 
 @click.command("query")

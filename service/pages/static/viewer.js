@@ -1,8 +1,7 @@
 // The viewer of a product: the image before and after with one view, one stretch and one readout. The view is in the address.
 import { CHANGE, changes, colourTable, exactText, levelLimits, LEVELS, MAP_NAMES, percentiles, STRETCHES, valueAt } from "./stretch.js";
 import { Renderer } from "./gl.js";
-import { Source } from "./planes.js";
-import { Readout } from "./readout.js";
+import { Readout, Source } from "./planes.js";
 import { addressOf, fitZoom, follow, imageAt, viewOf } from "./view.js";
 import { element, say, showHeader, told } from "./page.js";
 

@@ -17,7 +17,8 @@ import httpx
 import pytest
 
 from psfcore.transit.archive import pack
-from service.client import errors, resumable
+from service.client import connection, errors, http
+from service.client.connection import upload_in_parts
 from service.client.errors import ServiceError
 from tests.service.api.live import Live, running
 from tests.transit_files import write_transit
@@ -136,36 +137,36 @@ class Broken:
 
 
 def test_the_client_continues_after_cuts(live: Live, archive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(resumable, "PART_BYTES", 20_000)
+    monkeypatch.setattr(connection, "PART_BYTES", 20_000)
     monkeypatch.setattr(errors, "FIRST_WAIT_S", 0.3)
     said: list[str] = []
     broken = Broken(live, ["", "before", "after", ""])
-    found = resumable.upload(broken, archive, "transit", "mercury.tar", said.append)
+    found = upload_in_parts(broken, archive, "transit", "mercury.tar", said.append)
     assert found == f"/v1/transits/{hashlib.sha256(archive.read_bytes()).hexdigest()}"
     assert live.client.get(found)["bytes"] == archive.stat().st_size
     # The second part is cut and sent again; the answer to it is lost, but the service has it.
     assert broken.parts[:5] == [0, 20_000, 20_000, 40_000, 60_000]
     assert any("the upload continues at" in line for line in said)
     again = Broken(live, [])
-    assert resumable.upload(again, archive, "transit", "mercury.tar", said.append) == found
+    assert upload_in_parts(again, archive, "transit", "mercury.tar", said.append) == found
     assert again.parts == [], "a file that is there needs no bytes"
 
 
 def test_another_process_continues_the_upload(
     live: Live, archive: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(resumable, "PART_BYTES", 20_000)
+    monkeypatch.setattr(connection, "PART_BYTES", 20_000)
     with monkeypatch.context() as patched:
         patched.setattr(errors, "PATIENCE_S", -1.0)
         with pytest.raises(ServiceError, match="no answer"):
-            resumable.upload(Broken(live, ["", "", "before"]), archive, "transit", "m.tar", print)
+            upload_in_parts(Broken(live, ["", "", "before"]), archive, "transit", "m.tar", print)
     second = Broken(live, [])
     time.sleep(0.5)
-    resumable.upload(second, archive, "transit", "m.tar", print)
+    upload_in_parts(second, archive, "transit", "m.tar", print)
     assert second.parts[0] == 40_000
     write_transit(archive.parent / "other", images=3)
     pack(archive.parent / "other", archive)
-    monkeypatch.setattr(resumable, "FROM_BYTES", 1000)
+    monkeypatch.setattr(http, "FROM_BYTES", 1000)
     sent = live.client.upload_transit(archive)
     assert sent["id"] == hashlib.sha256(archive.read_bytes()).hexdigest(), (
         "a large transit, by the client itself"

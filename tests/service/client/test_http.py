@@ -13,8 +13,7 @@ from astropy.io import fits
 from fastapi.testclient import TestClient
 
 from service.client import errors, http
-from service.client.address import service_address
-from service.client.errors import ServiceError, WaitInterrupted
+from service.client.errors import ServiceError, WaitInterrupted, service_address
 from service.client.http import Client
 from tests.conftest import write_image, write_psf
 from tests.service.api.live import running

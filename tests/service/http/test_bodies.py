@@ -21,7 +21,7 @@ from fastapi.testclient import TestClient
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.header import HeaderSummary
 from service.app import create_app
-from service.http import uploads
+from service.http import files as http_files
 from tests.conftest import write_image
 from tests.service.conftest import refusal, settings_in
 from tests.service.keyed import Keyed, bearer, keyed
@@ -243,13 +243,13 @@ def test_inspections_of_uploads_do_not_use_the_threads_of_other_requests(
     write_image(tmp_path / "image.fits")
     content = (tmp_path / "image.fits").read_bytes()
     let_end = threading.Event()
-    inspect = uploads.read_summary
+    inspect = http_files.read_summary
 
     def slow(path: Path, limits: FitsLimits) -> HeaderSummary:
         let_end.wait(180.0)
         return inspect(path, limits)
 
-    monkeypatch.setattr(uploads, "read_summary", slow)
+    monkeypatch.setattr(http_files, "read_summary", slow)
     with ThreadPoolExecutor(64) as pool:
         sent = [pool.submit(api.post, "/v1/images", content=content) for _ in range(60)]
         try:

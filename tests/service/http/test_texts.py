@@ -13,6 +13,7 @@ from typing import Any
 from urllib.parse import quote
 
 import pytest
+from fastapi import APIRouter
 from fastapi.routing import APIRoute
 from fastapi.testclient import TestClient
 
@@ -132,10 +133,10 @@ def hidden_routes() -> Iterator[APIRoute]:
     """The routes of pages, and others that the description leaves out."""
     for package in (service.pages, service.vo):
         for module in pkgutil.iter_modules(package.__path__, f"{package.__name__}."):
-            router = getattr(importlib.import_module(module.name), "router", None)
-            for route in [] if router is None else router.routes:
-                if not (router.include_in_schema and route.include_in_schema) and route.path != "/logout":
-                    yield route
+            for router in vars(importlib.import_module(module.name)).values():
+                for route in router.routes if isinstance(router, APIRouter) else ():
+                    if not (router.include_in_schema and route.include_in_schema) and route.path != "/logout":
+                        yield route
 
 
 def in_path(
@@ -218,5 +219,5 @@ def test_no_text_makes_the_service_fail(strict: Settings, tmp_path: Path, what: 
                 count += 1
                 if answer.status_code >= 500:
                     failed.add(f"{answer.status_code}: {what} in {method} {address[:90]} {str(sent)[:200]}")
-    assert count > 300
+    assert count > 250
     assert not failed, "\n".join(sorted(failed)[:20])

@@ -14,6 +14,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.pages import assets
+from service.pages.rendering import templates
 from tests.conftest import write_image
 from tests.service.conftest import upload, work_through_bulks
 from workers.catalogue.catalogue import Catalogue
@@ -23,6 +24,7 @@ from workers.settings import Settings
 
 PAGES = Path(str(files("service.pages")))
 VENDOR = PAGES / "vendor"
+TEMPLATES = templates()
 # Budgets of a page, gzipped: bytes.
 HTML, CSS, OWN_SCRIPTS, ALL = 15_000, 10_000, 40_000, 90_000
 FEW = {"method": {"name": "richardson-lucy", "steps": 2}}
@@ -66,7 +68,7 @@ def imported_by(name: str) -> set[str]:
 
 def named_by(template: str) -> set[str]:
     """The files that a template names, with those of the templates that it extends or imports."""
-    text = (PAGES / "templates" / template).read_text("utf-8")
+    text = TEMPLATES[template]
     parts = re.findall(r"{%-?\s*(?:extends|from|include|import)\s+['\"]([\w./-]+)['\"]", text)
     return set(re.findall(r"asset\('([\w.-]+)'\)", text)).union(*map(named_by, parts))
 
@@ -78,11 +80,6 @@ def loaded_by(template: str) -> set[str]:
         found |= left
         left = {name for one in left if one.endswith(".js") for name in imported_by(one)} - found
     return found
-
-
-TEMPLATES = sorted(
-    path.relative_to(PAGES / "templates").as_posix() for path in PAGES.glob("templates/**/*.html")
-)
 
 
 def test_each_file_is_used_by_a_page() -> None:

@@ -1,4 +1,5 @@
-"""What is true of every page: its policy, that it is not kept, that names are text, and errors as pages."""
+"""What is true of every page: its policy, that it is not kept, that names are text, and errors as pages.
+Forms: which fields become parameters, and how wrong ones are refused."""
 
 from __future__ import annotations
 
@@ -14,9 +15,12 @@ from sqlalchemy.exc import OperationalError
 
 from psfcore.instruments.files import instrument_names
 from service.app import create_app
+from service.http.problems import Problem
+from service.pages.forms import job_request, number_field, parameters
 from service.pages.rendering import POLICY, counted, date, duration, number, percent, size
 from tests.conftest import write_image, write_psf
 from tests.service.conftest import upload
+from workers.contract.requests import CrossValidate, GapDiagnose, Report
 from workers.settings import Settings
 
 PERSON = {"Accept": "text/html,application/xhtml+xml,*/*;q=0.8"}
@@ -207,3 +211,32 @@ def test_numbers_are_written_with_their_units() -> None:
     assert [counted(number, "row") for number in (0, 1, 2)] == ["0 rows", "1 row", "2 rows"]
     assert date(None) == "-"
     assert date(0.0) == '<time datetime="1970-01-01T00:00:00+00:00">1970-01-01 00:00:00 UTC</time>'
+
+
+# --- forms ----------------------------------------------------------------------------------------------
+
+
+def test_the_fields_of_a_request_become_its_parameters() -> None:
+    form = {"shape": " core ", "seed": "", "runs": "3", "form_token": "x", "transit": "y"}
+    assert parameters(CrossValidate, form) == {"shape": "core", "runs": "3"}
+    assert parameters(Report, {"shapes": "1"}) == {"shapes": True, "dark_offsets": False}
+    figures = {"photon_gain_dn": "6.5", "read_noise_dn": "2"}
+    noise = {"photon_gain_dn": 6.5, "read_noise_dn": 2.0}
+    assert parameters(GapDiagnose, {"correct": "1", **figures}) == {"correct": True, "noise": noise}
+    with pytest.raises(Problem, match="as numbers in DN; got many"):
+        parameters(GapDiagnose, {"photon_gain_dn": "many"})
+
+
+def test_an_input_has_the_limits_of_its_parameter() -> None:
+    assert number_field("psf-build", "size") == 'type="number" name="size" min="64" max="4096" step="2"'
+    assert number_field("deconvolve", "steps") == 'type="number" name="steps" min="1" max="200"'
+
+
+def test_a_wrong_parameter_is_named() -> None:
+    job = job_request("psf-build", {"instrument": "hri_euv", "size": "128"})
+    assert job.kind == "psf-build" and job.parameters.size == 128
+    with pytest.raises(Problem, match="size: Input should be") as refused:
+        job_request("psf-build", {"instrument": "hri_euv", "size": "wide"})
+    assert refused.value.status == 422
+    with pytest.raises(Problem, match=r"method: expected name to be one of richardson-lucy, .*; got 'magic'"):
+        job_request("deconvolve", {"image_id": "0" * 64, "method": {"name": "magic"}})

@@ -19,9 +19,9 @@ from vo_models.vosi.availability import Availability
 from vo_models.vosi.capabilities import VOSICapabilities
 from vo_models.vosi.tables.models import VOSITableSet
 
-from service.vo.columns import OBSCORE, PRODUCTS, TABLES
 from service.vo.interfaces import OFFERED
 from service.vo.links import LINKS_TYPE, MOST_IDS
+from service.vo.votables import OBSCORE, PRODUCTS, TABLES
 from tests.service.conftest import execute
 from tests.service.keyed import Keyed
 from tests.service.vo.made import SHAPE, add_product

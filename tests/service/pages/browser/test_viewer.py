@@ -337,7 +337,7 @@ def test_coordinates_equal_those_of_astropy(page: Page, looked: Looked) -> None:
         described = json.dumps([list(card) for card in header.items()])
         pairs = script(
             page,
-            "readout.js",
+            "planes.js",
             f"{places}.map((place) => module.coordinates(new Map({described})).of(...place))",
         )
         right = [arcsec(WCS(header), *place) for place in places]

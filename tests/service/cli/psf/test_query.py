@@ -1,4 +1,5 @@
-"""``heliopsf psf published|get``, ``store psf get`` and a deconvolution that names a published PSF."""
+"""``heliopsf psf published|get``, ``store psf get`` and a deconvolution that names a published PSF.
+The command ``heliopsf cache``: lists and removes the built PSFs that are kept."""
 
 from __future__ import annotations
 
@@ -15,7 +16,7 @@ from psfcore.errors import DataError
 from psfcore.published_psfs import PUBLISHED
 from service.cli.main import main
 from service.client.http import Client
-from tests.conftest import write_image
+from tests.conftest import SMALL_INSTRUMENT, write_image
 from tests.published_server import NAME, published_fits, stand_in
 from workers.settings import Settings
 
@@ -95,3 +96,29 @@ def test_an_operator_adds_a_psf_for_all_and_its_citation_is_in_the_lineage(
     (made,) = [one["made"] for one in parents if one["type"] == "psf"]
     assert (made["doi"], made["citation"]) == (DOI, PUBLISHED[NAME].citation)
     assert "1.0.0: certified" in command("psf", "certify", row["id"], "--version", "1.0.0")
+
+
+# --- the built PSFs that are kept -----------------------------------------------------------------------
+
+
+def run(*words: str) -> str:
+    done = CliRunner().invoke(main, list(words))
+    assert done.exit_code == 0, done.output
+    return done.output
+
+
+def test_the_cache_is_listed_and_cleared(tmp_path: Path) -> None:
+    assert run("cache", "list").startswith("0 PSFs, 0.0 of 2048 MiB")
+    (tmp_path / "small.toml").write_text(SMALL_INSTRUMENT)
+    run("psf", "build", "--instrument", str(tmp_path / "small.toml"), "--size", "64", "-o", str(tmp_path / "a.fits"), "--local")  # fmt: skip
+    listed = run("cache", "list").splitlines()
+    assert len(listed) == 2 and listed[0].endswith("your instrument file, 64 px")
+    assert listed[1].startswith("1 PSFs")
+    assert run("cache", "clear").startswith("removed 1 PSFs")
+    assert run("cache", "list").startswith("0 PSFs")
+
+
+def test_a_wrong_size_is_told_in_one_line() -> None:
+    done = CliRunner(env={"HELIOPSF_CACHE_MIB": "much"}).invoke(main, ["cache", "list"])
+    assert done.exit_code == 1
+    assert done.output.startswith("Error: HELIOPSF_CACHE_MIB: expected a whole number")

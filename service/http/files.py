@@ -1,34 +1,120 @@
-"""Receives an upload: streams it to a temporary file, and at the same time hashes, counts and checks its bytes. The whole
-upload is never in memory."""
+"""Files of requests and answers.
+
+A stored file, or a content made from one, is sent with an ETag, which says whether the client has it already. An upload is streamed
+to a temporary file; at the same time its bytes are hashed, counted and checked. No whole file is ever in memory.
+"""
 
 from __future__ import annotations
 
+import base64
 import hashlib
+import json
+import logging
 from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Self
 
 import anyio.to_thread
-from fastapi import Request, Response
+from fastapi import Request
 from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import FileResponse, Response
 
 from psfcore.fits.header import HeaderSummary, read_summary
 from psfcore.fits.stored_psf import check_is_psf
-from psfcore.transit.archive import START_BYTES, ArchiveContents, archive_kind, could_be_archive, list_archive
+from psfcore.transit.archive import START_BYTES, archive_kind, could_be_archive, list_archive
 from service.client.outputs import base_name
 from service.http.callers import Caller
 from service.http.forms import FORM, FormPart, chunks_of, media_type_of, pieces_of
-from service.http.problems import Problem, as_problems
+from service.http.problems import Problem, as_problems, problem
 from service.http.quotas import Allowed
 from service.http.state import State
 from workers.catalogue.catalogue import Row
 from workers.catalogue.tables import ImageRow, PsfRow, TransitRow
+from workers.files.store import BadFile, Store, lost
 from workers.intake.uploads import image_row, transit_row, uploaded_psf_row
 
+log = logging.getLogger(__name__)
+
+FITS_TYPE, GZIP_TYPE, JSON_TYPE = "application/fits", "application/gzip", "application/json"
 FITS_STARTS = (b"SIMPLE  =", b"\x1f\x8b")  # FITS, or FITS in gzip
 FORM_BYTES = 2**16  # largest size of a form without its file
 UNDECLARED_BYTES = 2**20  # bytes that are counted in one step if the request does not declare its length
+KEPT = "private, max-age=31536000, immutable"  # the content at an address never changes
+
+
+def send(
+    request: Request,
+    store: Store,
+    digest: str | None,
+    media_type: str,
+    filename: str | None,
+    *,
+    size: int | None = None,
+    missing: tuple[str, str] | None = None,
+) -> Response:
+    """The file with this SHA-256 as ETag, or 304 if the client already has it. size: as for ``path_of``.
+
+    Clients can check the received file against the SHA-256 in the header Repr-Digest (RFC 9530). Raises ``Problem`` 410
+    if the file is lost, and 404 with the code and the message of ``missing`` if digest is None.
+    """
+    if digest is None:
+        assert missing is not None
+        raise Problem(404, *missing)
+    content = base64.b64encode(bytes.fromhex(digest)).decode()
+    headers = {"ETag": f'"{digest}"', "Cache-Control": KEPT, "Repr-Digest": f"sha-256=:{content}:"}
+    if _client_has(request, headers["ETag"]):
+        return Response(status_code=304, headers=headers)
+    path = path_of(store, digest, size)
+    return FileResponse(path, media_type=media_type, filename=filename, headers=headers)
+
+
+def headers_of(content: str) -> dict[str, str]:
+    """The headers of an answer that is made from stored files. content: a text that determines the answer."""
+    return {"ETag": f'"{hashlib.sha256(content.encode()).hexdigest()}"', "Cache-Control": KEPT}
+
+
+def not_modified(request: Request, headers: dict[str, str]) -> Response | None:
+    """The answer 304 if the client already has the content with these headers; otherwise None."""
+    return Response(status_code=304, headers=headers) if _client_has(request, headers["ETag"]) else None
+
+
+def json_of(store: Store, digest: str, size: int | None = None) -> dict[str, Any]:
+    """The content of a stored JSON file. Errors and size: as for ``path_of``."""
+    content: dict[str, Any] = json.loads(path_of(store, digest, size).read_bytes())
+    return content
+
+
+def path_of(store: Store, digest: str, size: int | None = None) -> Path:
+    """The path of a stored file, after a check. Raises ``Problem`` 410 if the file is lost or damaged.
+
+    size: the recorded size of the file, bytes; the check then reads only the size. None: the check reads the whole file,
+    which must therefore be small.
+    """
+    try:
+        if size is not None:
+            path = store.path(digest)
+            if path.stat().st_size == size:
+                return path
+        return store.verified(digest)
+    except FileNotFoundError as error:
+        raise _logged(lost(digest)) from error
+    except BadFile as error:
+        raise _logged(error) from error
+
+
+def _logged(error: BadFile) -> Problem:
+    log.error("%s", error.message)
+    return problem(error)
+
+
+def _client_has(request: Request, etag: str) -> bool:
+    """Whether the client already has the content of this ETag (If-None-Match)."""
+    tags = [tag.strip().removeprefix("W/") for tag in request.headers.get("if-none-match", "").split(",")]
+    return "*" in tags or etag in tags
+
+
+# --- uploads --------------------------------------------------------------------------------------------
 
 
 def _body(what: str, media_type: str) -> dict[str, Any]:
@@ -138,14 +224,6 @@ class Received:
         return self._digest.hexdigest()
 
 
-def _could_be_fits(start: bytes, _whole: bool) -> bool:
-    return any(start.startswith(beginning[: len(start)]) for beginning in FITS_STARTS)
-
-
-def _image_content(path: Path, state: State) -> HeaderSummary:
-    return read_summary(path, state.limits)
-
-
 def _psf_content(path: Path, state: State) -> HeaderSummary:
     limits = state.settings.psf_limits
     summary = read_summary(path, limits)
@@ -153,13 +231,19 @@ def _psf_content(path: Path, state: State) -> HeaderSummary:
     return summary
 
 
-def _transit_content(path: Path, state: State) -> ArchiveContents:
-    return list_archive(path, state.settings.archive_limits)
-
-
 _FITS = ("a FITS file, which starts with 'SIMPLE  ='", "not-fits")
-_FITS_START = (max(map(len, FITS_STARTS)), _could_be_fits)
-IMAGE = Kind("/v1/images", *_FITS, ImageRow, *_FITS_START, _image_content, image_row)
+_FITS_START = (
+    max(map(len, FITS_STARTS)),
+    lambda start, _whole: any(start.startswith(one[: len(start)]) for one in FITS_STARTS),
+)
+IMAGE = Kind(
+    "/v1/images",
+    *_FITS,
+    ImageRow,
+    *_FITS_START,
+    lambda path, state: read_summary(path, state.limits),
+    image_row,
+)
 PSF = Kind("/v1/psfs", *_FITS, PsfRow, *_FITS_START, _psf_content, uploaded_psf_row, limit="max_psf_bytes")
 TRANSIT = Kind(
     "/v1/transits",
@@ -168,7 +252,7 @@ TRANSIT = Kind(
     TransitRow,
     START_BYTES,
     lambda start, whole: could_be_archive(start) and (not whole or bool(archive_kind(start))),
-    _transit_content,
+    lambda path, state: list_archive(path, state.settings.archive_limits),
     transit_row,
     limit="max_transit_bytes",
 )

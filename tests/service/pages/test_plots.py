@@ -6,8 +6,20 @@ from itertools import pairwise
 
 import pytest
 
-from service.pages.plots import FINE_TO_PX, RATIO, Plot, Series, shown_radii, with_errors, written
-from service.pages.readings import ABOVE, BELOW, MAP_PX, gap_map, rerun_makers
+from service.pages.plots import (
+    ABOVE,
+    BELOW,
+    FINE_TO_PX,
+    MAP_PX,
+    RATIO,
+    Plot,
+    Series,
+    gap_map,
+    rerun_makers,
+    shown_radii,
+    with_errors,
+    written,
+)
 
 
 def test_the_table_holds_x_the_values_and_the_ends_of_the_band() -> None:

@@ -1,0 +1,412 @@
+"""The commands on a transit: ``report`` tests a PSF on it; ``gap`` finds where the fitted model and the images differ and which
+effect explains the difference, measures on blind cases how often this is right, and says what a planned transit would show.
+
+A command imports numerical libraries only when it is called, so that other commands start fast.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import click
+
+from psfcore.errors import DataError
+from service.cli.connection import LOCAL, SERVER, connection, named_psf, psf_option
+from service.cli.options import (
+    DRAWN,
+    FILE,
+    JSON,
+    OUTPUT,
+    OUTPUT_FOLDER,
+    PLOT,
+    SEED,
+    limits,
+    options_of,
+    progress_bar,
+    user_errors,
+    write_json,
+    writes_files,
+)
+from service.cli.progress import echo
+from service.client.outputs import written
+from workers.contract.requests import GapDiagnose, Report
+
+SHOWN = 3
+UNKNOWN = "unknown"
+THREADS = 2  # of a plan
+# The diagnosis runs as a command in another process, which does not know the withheld effects.
+DIAGNOSE = (
+    sys.executable,
+    "-P",  # nothing is imported from the working folder
+    "-c",
+    "from service.cli.main import main; main()",
+    "gap",
+    "{transit}",
+    "--json",
+    "{report}",
+    "--local",
+)
+# The ideal observer also runs in another process, because the blind set and the gap library share no code.
+IDEAL = (sys.executable, "-P", "-m", "psfcore.gap.ideal_observer", "{expected}", "{ideal}")
+
+
+@click.command()
+@click.argument("transit", type=click.Path(exists=True, path_type=Path))
+@click.option("-o", "--output", type=DRAWN, help="Write the result as an HTML page")
+@JSON
+@PLOT
+@psf_option("PSF to test: an id or a file [default: fit a PSF to TRANSIT]")
+@options_of(Report, "dark_offsets", "shapes", "seed", "noise", "saturation_dn")
+@SERVER
+@LOCAL
+@writes_files
+def report(
+    transit: Path,
+    output: Path | None,
+    json_file: Path | None,
+    plot: Path | None,
+    psf: str | None,
+    server: str | None,
+    local: bool,
+    overwrite: bool,
+    **parameters: Any,
+) -> None:
+    """Fit a PSF to TRANSIT, or test a PSF on it: compare simulated and observed light in the occulter's disc.
+
+    TRANSIT is a folder with a transit.json, or a .zip or .tar file of such a folder. Without --psf every image is tested with
+    a PSF that was fitted to other images. Name at least one output: -o, --json or --plot.
+    """
+    if output is None and json_file is None and plot is None:
+        raise click.UsageError(
+            "expected an output: -o PAGE.html, --json FILE or --plot FILE; got none of them"
+        )
+    if parameters["shapes"] and psf is not None:
+        raise click.UsageError(
+            "--shapes fits every shape to TRANSIT, so it cannot be used with --psf: remove one of the two"
+        )
+    with (
+        user_errors(),
+        TemporaryDirectory(prefix="heliopsf-") as folder,
+        connection(server, local) as service,
+        progress_bar() as say,
+    ):
+        numbers = json_file or Path(folder) / "report.json"
+        found = service.report(
+            transit,
+            numbers,
+            page=output,
+            preview=plot,
+            progress=say,
+            psf_id=named_psf(service, psf),
+            overwrite=overwrite,
+            **parameters,
+        )
+        told = json.loads(numbers.read_text("utf-8"))
+    from psfcore.evaluation.summary_lines import summary_lines
+
+    files = ", ".join(str(path) for path in (output, json_file, plot) if path is not None)
+    echo(f"{files}: {found['details']['sentence']}")
+    echo("\n".join(summary_lines(told["evaluation"], told.get("shapes"))))
+    for limit in found["details"]["limits"]:
+        echo(f"  note: {limit}")
+    for missing in found["details"]["not_shown"]:
+        echo(f"  not shown: {missing['what']} ({missing['why']})")
+
+
+# --- a gap ----------------------------------------------------------------------------------------------
+
+
+class _DiagnosisByDefault(click.Group):
+    """A group whose default command is ``diagnose``: ``heliopsf gap DIR`` means ``heliopsf gap diagnose DIR``."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        if args and args[0] not in self.commands and args[0] not in ctx.help_option_names:
+            args = ["diagnose", *args]
+        return super().parse_args(ctx, args)
+
+
+@click.group(
+    cls=_DiagnosisByDefault,
+    help="Find out why a fitted PSF and a transit differ. `heliopsf gap TRANSIT` is short for `heliopsf gap diagnose TRANSIT`. "
+    "`heliopsf gap diagnose -h` lists its options.",
+    short_help="Find why a fitted PSF and a transit differ.",
+)
+def gap() -> None:
+    """The gap between a fitted model and the images of a transit."""
+
+
+@gap.command(short_help="Find the effects that explain a gap.")
+@click.argument("transit", type=click.Path(exists=True, path_type=Path))
+@click.option("-o", "--output", type=DRAWN, help="Write the result as an HTML page")
+@JSON
+@PLOT
+@psf_option(
+    "PSF (an id or a file) with the shape and the start parameters of the fit [default: the default shape]"
+)
+@click.option(
+    "--corrected",
+    "corrected_file",
+    type=OUTPUT,
+    help="Write the corrected PSF (FITS): the PSF fitted with the answer in the model; for a tie, with the best effect",
+)
+@click.option(
+    "--effects",
+    metavar="FILE.py|MODULE[,...]",
+    help="Also test the effects in these files, whose code is executed. Only with --local; in a service set HELIOPSF_GAP_EFFECTS",
+)
+@options_of(GapDiagnose, "coverage", "seed", "noise", "saturation_dn")
+@SERVER
+@LOCAL
+@writes_files
+def diagnose(
+    transit: Path,
+    output: Path | None,
+    json_file: Path | None,
+    plot: Path | None,
+    psf: str | None,
+    corrected_file: Path | None,
+    effects: str | None,
+    server: str | None,
+    local: bool,
+    overwrite: bool,
+    **parameters: Any,
+) -> None:
+    """Diagnose the gap between TRANSIT and the model fitted to it: which effect explains the residuals.
+
+    TRANSIT is a folder with a transit.json, or a .zip or .tar file of such a folder.
+    """
+    if effects is not None and not local:
+        raise click.UsageError(
+            "--effects: expected --local with it; a service tests the effects in HELIOPSF_GAP_EFFECTS"
+        )
+    with (
+        user_errors(),
+        TemporaryDirectory(prefix="heliopsf-") as folder,
+        connection(server, local, gap_effects=effects or "") as service,
+        progress_bar() as say,
+    ):
+        numbers = json_file or Path(folder) / "report.json"
+        found = service.diagnose_gap(
+            transit,
+            numbers,
+            page=output,
+            preview=plot,
+            progress=say,
+            psf_id=named_psf(service, psf),
+            # A service always makes the corrected PSF and keeps it, so that later requests find it.
+            correct=corrected_file is not None or not local,
+            overwrite=overwrite,
+            **parameters,
+        )
+        report = json.loads(numbers.read_text("utf-8"))
+        corrected = found["details"]["corrected_psf_id"]
+        if corrected_file is not None and corrected is not None:
+            service.download(f"/v1/psfs/{corrected}/file", corrected_file, overwrite=overwrite)
+    echo("\n".join(_lines(report)))
+    files = [output, json_file, plot, corrected_file if corrected else None]
+    if any(files):
+        echo(f"written: {', '.join(str(path) for path in files if path is not None)}")
+    step = _next_step(report, f"{transit}{' --local' if local else ''}", output, corrected_file)
+    if step:
+        echo(f"next: {step}")
+    if corrected_file is not None and corrected is None:
+        raise click.ClickException(
+            f"{corrected_file} was not written: the diagnosis found no effect for a corrected PSF (verdict {report['verdict']})"
+        )
+
+
+def _next_step(report: dict[str, Any], transit: str, page: Path | None, corrected: Path | None) -> str:
+    """What to do with this verdict, in one line; empty if there is nothing to do."""
+    if report["verdict"] in ("attributed", "tie") and corrected is None:
+        return f"`heliopsf gap {transit} --corrected PSF.fits` writes the PSF without the effect"
+    if report["verdict"] in ("inconclusive", "tie"):
+        return "`heliopsf gap plan PLAN` tells whether images that are not taken yet would decide"
+    if report["verdict"] == "unknown":
+        where = "-o PAGE.html writes a page with" if page is None else f"{page} has"
+        return f"{where} the map or the curve of the unknown cause"
+    return ""
+
+
+def _lines(report: dict[str, Any]) -> list[str]:
+    """The answer of the report as lines to print. The JSON and the page have all effects."""
+    so_far = "most probable: " if report["verdict"] == "inconclusive" else ""
+    answer = f" ({so_far}{', '.join(report['answer'])})" if report["answer"] else ""
+    out = [report["sentence"], f"verdict: {report['verdict']}{answer}"]
+    in_set = {" + ".join(names) for names in report["set"]["members"]}
+    # The fields of an unknown cause follow as their own lines.
+    named = [one for one in (*report["together"], *report["effects"]) if one["name"] in in_set - {UNKNOWN}]
+    for effect in named[:SHOWN]:
+        closure = effect["closure"]
+        closed = "" if closure is None else f", held-out closure {100 * closure['value']:.0f} %"
+        numbers = ", ".join(
+            f"{name} {p['value']:.3g} ± {p['sigma']:.2g} {p['unit']}".strip()
+            for name, p in effect["parameters"].items()
+            if not name.rpartition(".")[2].startswith("bump_")
+        )
+        found = f"P = {effect['probability']:.2f}{closed}"
+        out.append(f"  {effect['name']:<24} {found}{': ' if numbers else ''}{numbers}")
+    if report["verdict"] != "none":
+        out += [f"  looks like: {_field(one)}" for one in report["unknown"]["fields"]]
+    if report["untestable"]:
+        out.append(f"  not testable: {', '.join(one['name'] for one in report['untestable'])}")
+    return out + [f"  caution: {caution}" for caution in report["cautions"]]
+
+
+def _field(field: dict[str, Any]) -> str:
+    """A field of an unknown cause as text."""
+    beside = "".join(f", beside {name}" for name in field["beside"])
+    said = f"{field['words']}{beside} (P = {field['probability']:.2f})"
+    if field["strength"] is not None:
+        value, sigma = field["strength"]["value"], field["strength"]["sigma"]
+        said += f": {value:.3g} ± {sigma:.2g} {field['unit']}".rstrip()
+    if field["closure"] is not None:
+        said += f", held-out closure {100 * field['closure']['value']:.0f} %"
+    return said
+
+
+# --- blind cases ----------------------------------------------------------------------------------------
+
+
+@gap.command(short_help="Test the diagnosis on simulated cases.")
+@click.option("--cases", default=24, type=click.IntRange(1, 9999), help="Number of cases")
+@click.option("--seed", default=1, type=click.IntRange(0), help="Seed of random numbers")
+@click.option("-o", "--output", required=True, type=OUTPUT_FOLDER, help="Folder of the set")
+@click.option("--size", default=256, type=click.IntRange(128, 1024), help="Width and height, px")
+@click.option("--images", default=18, type=click.IntRange(6, 200), help="Images per transit")
+@click.option(
+    "--processes",
+    default=2,
+    type=click.IntRange(1, 64),
+    help="Number of diagnoses that run at the same time",
+)
+@click.option("--keep", is_flag=True, help="Keep the images of each case after their use")
+@click.option("--scenes", multiple=True, type=FILE, help="Take scenes from these images (FITS), in turn")
+@click.option("--only", multiple=True, metavar="EFFECT", help="Use only these effects, one per case, in turn")
+@click.option(
+    "--left",
+    "left_pct",
+    multiple=True,
+    type=click.FloatRange(0.05, 50),
+    metavar="PCT",
+    help="Residual in the discs, percent, that remains when the PSF is fitted to images with the effect; repeat to vary it "
+    "[default: random, 0.5 to 10]",
+)
+@click.option(
+    "--simulator",
+    default="",
+    show_default=False,
+    metavar="FILE.py|MODULE",
+    help="Let the function make_case of this file or module make the cases; its code is executed (docs/gap.md)",
+)
+@click.option("--clean-only", is_flag=True, help="Make only cases without an effect, to count false alarms")
+@click.option(
+    "--synthetic",
+    is_flag=True,
+    help="Use a synthetic diffraction PSF, which is made faster than the PSF of the instrument",
+)
+@click.option(
+    "--make-only", is_flag=True, help="Make and seal the cases and keep the transits, but diagnose nothing"
+)
+def blind(
+    cases: int,
+    seed: int,
+    output: Path,
+    size: int,
+    images: int,
+    processes: int,
+    keep: bool,
+    scenes: tuple[Path, ...],
+    only: tuple[str, ...],
+    left_pct: tuple[float, ...],
+    simulator: str,
+    clean_only: bool,
+    synthetic: bool,
+    make_only: bool,
+) -> None:
+    """Test the diagnosis on simulated cases whose effect is withheld from the diagnosis. To continue a stopped run,
+    repeat the command."""
+    from psfcore.blind.case_set import alone_in, make_set
+    from psfcore.blind.cases import SetPlan
+    from psfcore.blind.run_set import run_set
+    from psfcore.blind.score import write_score
+    from psfcore.simulate.inputs import image_rate
+
+    def say(line: str) -> None:
+        echo(line, err=True)
+
+    if clean_only and only:
+        raise click.UsageError("expected one of --clean-only and --only; got both")
+    if simulator and (only or clean_only or synthetic or left_pct or scenes):
+        raise click.UsageError(
+            "expected --simulator without --only, --left, --scenes, --clean-only and --synthetic, because the simulator "
+            "chooses its cases; got one of them"
+        )
+    with user_errors(), alone_in(output):
+        plan = SetPlan(cases, seed, size, images, 0, only, clean_only, not synthetic, left_pct, simulator)
+        planes = [image_rate(file, limits()) for file in scenes]
+        made, not_made = make_set(output, plan, scenes=planes, processes=processes, progress=say)
+        numbers = [number for number in plan.numbers if number not in not_made]
+        if not numbers:
+            why = next(iter(not_made.values()))
+            raise DataError(
+                "no-case-made", f"none of the {cases} cases could be made; the first failed with: {why}"
+            )
+        if make_only:
+            echo(f"{output}: {len(numbers)} of {cases} cases made and sealed")
+            return
+        run_set(made, numbers, DIAGNOSE, ideal=IDEAL, processes=processes, keep=keep, progress=say)
+        echo(write_score(made, numbers, not_made))
+
+
+# --- a planned transit ----------------------------------------------------------------------------------
+
+
+@gap.command(short_help="Find what a planned transit would show.")
+@click.argument("plan_file", metavar="PLAN", type=click.Path(exists=True, path_type=Path))
+@click.option("-o", "--output", type=DRAWN, help="Write the result as an HTML page")
+@JSON
+@click.option(
+    "--instrument",
+    metavar="NAME|FILE",
+    help="Use the diffraction PSF of this instrument [default: the instrument of the transit, else hri_euv]",
+)
+@click.option("--diffraction", type=FILE, help="Use this diffraction PSF (FITS, sum 1)")
+@SEED
+@writes_files
+def plan(
+    plan_file: Path,
+    output: Path | None,
+    json_file: Path | None,
+    instrument: str | None,
+    diffraction: Path | None,
+    seed: int,
+    overwrite: bool,
+) -> None:
+    """Find the strength at which each effect would be found in the images of PLAN, and which effects would look alike.
+
+    PLAN is a plan (JSON), the truth.json of a simulated transit, a transit.json, or a folder with a transit.json. Its images
+    need not exist: transit.json may state size_px, and the exposure_s of each image.
+    """
+    from psfcore.gap.planning import limits_of_file
+    from psfcore.gap.report.limits import lines, plan_page
+
+    with user_errors():
+        with progress_bar() as say:
+            found = limits_of_file(
+                plan_file,
+                limits(),
+                instrument=instrument,
+                diffraction=diffraction,
+                seed=seed,
+                threads=THREADS,
+                progress=say,
+            )
+        write_json(json_file, found.as_json(), overwrite=overwrite)
+        if output is not None:
+            with written(output, overwrite=overwrite) as partial:
+                partial.write_text(plan_page(found), "utf-8")
+    echo("\n".join(lines(found)))

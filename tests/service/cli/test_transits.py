@@ -1,0 +1,465 @@
+"""Reports, diagnoses, blind cases and plans on the command line; reports and diagnoses over HTTP too."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from click.testing import CliRunner, Result
+from fastapi.testclient import TestClient
+
+from psfcore.errors import DataError
+from psfcore.fits.images import write_plane
+from psfcore.gap import planning
+from psfcore.gap.diagnose import Diagnosis, diagnose
+from psfcore.gap.library.registry import LIBRARY
+from psfcore.psf import REACH_GRID_PX
+from psfcore.simulate.plan import default_plan
+from psfcore.simulate.scatter_truth import total_kernel
+from psfcore.transit.archive import pack
+from service.cli.main import main
+from service.cli.transits import _lines
+from tests.gap_files import EDGE_GLOW, GLOW_DN_S, answer_at_once, quick_diagnosis, small_reach, write_gap
+from tests.html_page import check_stands_alone, read_page
+from tests.service.conftest import upload
+from tests.transit_files import TRUTH, diffraction, write_simulated
+from workers.tasks import gap as gap_task
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_simulated(tmp_path_factory.mktemp("simulated") / "transit")
+
+
+@pytest.fixture
+def psf(tmp_path: Path) -> Path:
+    """The true PSF, small enough for the service of these tests."""
+    path = tmp_path / "true.fits"
+    kernel = total_kernel(TRUTH, diffraction(), REACH_GRID_PX)
+    fits.PrimaryHDU(kernel[896:-896, 896:-896].astype("f4")).writeto(path)
+    return path
+
+
+def test_a_transit_becomes_a_page(
+    api: TestClient, run_jobs: Callable[[], None], simulated: Path, psf: Path, tmp_path: Path
+) -> None:
+    pack(simulated, tmp_path / "transit.tar")
+    transit_id = upload(api, tmp_path / "transit.tar", "/v1/transits")
+    parameters = {"transit_id": transit_id, "psf_id": upload(api, psf, "/v1/psfs")}
+    asked = api.post("/v1/jobs", json={"kind": "report", "parameters": parameters})
+    assert asked.status_code == 202, asked.text
+    run_jobs()
+    job = api.get(asked.headers["location"]).json()
+    assert job["phase"] == "COMPLETED", job["error"]
+    report = api.get(job["result"]).json()
+    assert report["kind"] == "report" and report["transit_id"] == transit_id
+    page = api.get(report["html"])
+    assert page.headers["content-type"] == "text/html; charset=utf-8"
+    policy = page.headers["content-security-policy"]
+    assert policy.startswith("default-src 'none'; img-src data:; style-src 'unsafe-inline'")
+    check_stands_alone(page.text)
+    again = api.get(report["html"], headers={"If-None-Match": page.headers["etag"]})
+    assert again.status_code == 304 and again.headers["content-security-policy"] == policy
+    assert api.get(report["file"]).json()["schema"] == "psf-report/1"
+    assert api.get(report["preview"]).content.startswith(b"\x89PNG")
+    equal = api.post("/v1/jobs", json={"kind": "report", "parameters": parameters})
+    assert equal.status_code == 200 and equal.json()["id"] == job["id"]
+
+
+def test_the_command_writes_the_page_and_its_numbers(simulated: Path, psf: Path, tmp_path: Path) -> None:
+    page, numbers = tmp_path / "R.html", tmp_path / "R.json"
+    arguments = ["report", simulated, "-o", page, "--json", numbers, "--psf", psf, "--local"]
+    done = CliRunner().invoke(main, [str(one) for one in arguments])
+    assert done.exit_code == 0, done.output
+    check_stands_alone(page.read_text("utf-8"))
+    told = json.loads(numbers.read_text())
+    assert told["sentence"] in done.output
+    whole = told["evaluation"]["all"]
+    assert f"all pointings: {whole['images']} images, mean {whole['mean_pct']:+.2f} %" in done.output
+    pointings = [
+        line for line in done.output.splitlines() if line.startswith("pointing ") and "images" in line
+    ]
+    assert len(pointings) == len(told["evaluation"]["pointings"])
+    assert "the PSF was given, and no fit was made" in done.output
+
+
+def test_a_plot_alone_is_enough_and_noise_may_come_with_the_command(
+    simulated: Path, psf: Path, tmp_path: Path
+) -> None:
+    plots = [tmp_path / name for name in ("quiet.png", "loud.png")]
+    said = []
+    for plot, noise in zip(plots, ((), ("--noise", "24", "8")), strict=True):
+        arguments = [
+            "report",
+            simulated,
+            "--plot",
+            plot,
+            "--psf",
+            psf,
+            "--no-dark-offsets",
+            "--local",
+            *noise,
+        ]
+        done = CliRunner().invoke(main, [str(one) for one in arguments])
+        assert done.exit_code == 0, done.output
+        assert plot.read_bytes().startswith(b"\x89PNG")
+        said.append(next(line for line in done.output.splitlines() if line.startswith("all pointings")))
+    assert said[0] != said[1]
+
+
+def test_what_is_wrong_with_a_report_is_said_in_a_line_and_nothing_is_written(
+    subtests: pytest.Subtests, simulated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for arguments, said in (
+        (["-o", "no/such/folder/R.html"], "there is no folder"),
+        (["-o", "R.html", "--psf", "missing.fits"], "expected a PSF id"),
+        (["-o", "R.html", "--noise", "-1", "2"], "greater than or equal to 0"),
+        (["-o", "R.html", "--seed", "-1"], "not in the range"),
+        ([], "expected an output: -o PAGE.html, --json FILE or --plot FILE"),
+        (["-o", "R.html", "--shapes", "--psf", 64 * "a"], "--shapes fits every shape to TRANSIT"),
+    ):
+        with subtests.test(str((arguments, said))):
+            monkeypatch.chdir(tmp_path)
+            done = CliRunner().invoke(main, ["report", str(simulated), "--local", *arguments])
+            assert done.exit_code != 0 and said in done.output and "Traceback" not in done.output
+            assert list(tmp_path.iterdir()) == []
+
+
+# --- a gap ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _small_reach() -> Iterator[None]:
+    with small_reach():
+        yield
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A transit with light at its right edge."""
+    return write_gap(tmp_path_factory.mktemp("simulated") / "transit", light_dn_s=GLOW_DN_S)
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(main, ["gap", *(str(one) for one in arguments)])
+
+
+@dataclass(frozen=True)
+class Diagnosed:
+    """A command, the folder of the files that it wrote, and the diagnosis that its job made."""
+
+    done: Result
+    out: Path
+    found: Diagnosis
+
+
+@pytest.fixture(scope="module")
+def diagnosed(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Diagnosed:
+    """Nothing is patched but the library's length; the light that the file describes is in the images."""
+    out, made = tmp_path_factory.mktemp("diagnosed"), []
+    (out / "mine.py").write_text(EDGE_GLOW)
+
+    def kept(*given: Any, **how: Any) -> Diagnosis:
+        made.append(diagnose(*given, **how))
+        return made[0]
+
+    with quick_diagnosis(), patch.object(gap_task, "diagnose", kept):
+        done = run(
+            folder, "--local", "--effects", out / "mine.py", "--json", out / "g.json", "-o", out / "g.html",
+            "--plot", out / "g.png", "--corrected", out / "psf.fits",
+        )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    return Diagnosed(done, out, made[0])
+
+
+def test_an_effect_of_one_s_own_is_found_with_its_size(diagnosed: Diagnosed) -> None:
+    done, out = diagnosed.done, diagnosed.out
+    report = json.loads((out / "g.json").read_text())
+    assert report["verdict"] == "attributed" and report["answer"] == ["edge_glow"]
+    height = report["effects"][0]["parameters"]["height"]
+    assert height["value"] == pytest.approx(GLOW_DN_S, abs=4 * height["sigma"])
+    assert height["unit"] == "DN/s" and height["sigma"] < GLOW_DN_S / 5
+    said = done.stdout.splitlines()  # a slow machine reports progress on stderr
+    assert said[:2] == [report["sentence"], "verdict: attributed (edge_glow)"]
+    assert any(line.startswith("  not testable: ") and "saturation_fill" in line for line in said)
+    files = ", ".join(str(out / name) for name in ("g.html", "g.json", "g.png", "psf.fits"))
+    assert said[-1] == f"written: {files}", "the corrected PSF was asked for: nothing is left to do"
+    html = (out / "g.html").read_text("utf-8")
+    check_stands_alone(html)
+    assert "A lamp beside the detector lights its right edge." in html
+    # Its code's hash is among what made the report.
+    (digest,) = report["provenance"]["added_effects"].values()
+    assert digest in [tag.text for tag in read_page(html) if tag.name == "dd"]
+    assert (out / "g.png").read_bytes().startswith(b"\x89PNG")
+    header = fits.getheader(out / "psf.fits")
+    assert header["PSFNAME"] == "hri_euv-gap-corrected"
+    assert "edge_glow" in "".join(header["HISTORY"]).replace("\n", "")
+
+
+def test_a_request_cannot_choose_whose_code_is_run(api: TestClient, folder: Path, tmp_path: Path) -> None:
+    pack(folder, tmp_path / "transit.tar")
+    transit_id = upload(api, tmp_path / "transit.tar", "/v1/transits")
+    wrong: tuple[dict[str, Any], ...] = (
+        {"added_effects": ["os"]}, {"effects": "mine.py"}, {"coverage": 0.99}, {"correct": "perhaps"},
+    )  # fmt: skip
+    for one in wrong:
+        request = {"kind": "gap-diagnose", "parameters": {"transit_id": transit_id, **one}}
+        assert api.post("/v1/jobs", json=request).status_code == 422, one
+
+
+def test_a_psf_that_was_not_fitted_is_no_start(folder: Path, tmp_path: Path) -> None:
+    kernel = np.zeros((33, 33), "f4")
+    kernel[16, 16] = 1.0
+    fits.PrimaryHDU(kernel).writeto(tmp_path / "point.fits")
+    done = run(folder, "--local", "--psf", tmp_path / "point.fits")
+    assert done.exit_code == 1 and "expected a PSF that was fitted to a transit" in done.output
+
+
+def test_a_corrected_psf_that_there_is_not_is_said_after_all_else(
+    folder: Path, diagnosed: Diagnosed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judgement = replace(diagnosed.found.judgement, verdict="none", answer=())
+    asked = answer_at_once(monkeypatch, replace(diagnosed.found, judgement=judgement, corrected=()))
+    psf, numbers = tmp_path / "psf.fits", tmp_path / "g.json"
+    done = run(folder, "--local", "--corrected", psf, "--json", numbers, "--coverage", 0.8)
+    assert [how["coverage"] for how in asked] == [0.8]
+    assert done.exit_code == 1 and not psf.exists()
+    assert done.output.splitlines()[1] == "verdict: none"
+    assert "was not written: the diagnosis found no effect for a corrected PSF (verdict none)" in done.output
+    assert json.loads(numbers.read_text())["verdict"] == "none"
+
+
+def test_the_next_step_is_a_command_that_works_here(
+    folder: Path, diagnosed: Diagnosed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answer_at_once(monkeypatch, replace(diagnosed.found, corrected=()))
+    said = run(folder, "--local").output.splitlines()
+    assert said[-1].startswith(f"next: `heliopsf gap {folder} --local --corrected ")
+
+
+def test_what_is_wrong_with_a_diagnosis_is_said_in_a_line_and_nothing_is_written(
+    subtests: pytest.Subtests, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for arguments, said in (
+        (["--json", "no/such/folder/g.json", "--local"], "there is no folder"),
+        (["--corrected", "no/such/folder/p.fits", "--local"], "there is no folder"),
+        (["--psf", "missing.fits", "--local"], "expected a PSF id (8 or more hexadecimal digits) or a file"),
+        (["--psf", "0" * 64, "--local"], "expected the id of one of your PSFs"),
+        (["--effects", "mine.py"], "--effects: expected --local with it"),
+        (["--effects", "mine.py", "--local"], "effects of mine.py: expected a readable Python file"),
+        (["--effects", "no_such_module_anywhere", "--local"], "No module named 'no_such_module_anywhere'"),
+        (["--effects", "json", "--local"], "effects of json: expected EFFECTS to be a tuple of Effect"),
+        (["--noise", "-1", "2", "--local"], "greater than or equal to 0"),
+        (["--seed", "-1", "--local"], "not in the range"),
+        (["--coverage", "0.99", "--local"], "not in the range 0.5<=x<=0.95"),
+        (["--server", "http://127.0.0.1:9"], "127.0.0.1:9"),
+    ):
+        with subtests.test(str((arguments, said))):
+            monkeypatch.chdir(tmp_path)
+            done = run(folder, *arguments)
+            assert done.exit_code != 0 and said in done.output and "Traceback" not in done.output
+            assert list(tmp_path.iterdir()) == []
+
+
+def test_effects_that_clash_with_the_library_s_are_told(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(EDGE_GLOW.replace("edge_glow", "ghost"))
+    done = run(folder, "--local", "--effects", tmp_path / "mine.py")
+    assert done.exit_code == 1
+    assert "expected unique effect names; got 'ghost' twice" in done.output
+
+
+def test_a_folder_without_a_transit_and_a_word_that_is_neither_are_told(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    done = run(tmp_path / "empty", "--local")
+    assert done.exit_code == 1 and "transit.json" in done.output
+    done = run(tmp_path / "nothing-here", "--local")
+    assert done.exit_code == 2 and "does not exist" in done.output
+
+
+def test_the_transit_may_come_after_the_options_and_help_names_both_commands(folder: Path) -> None:
+    done = run("--seed", "-1", folder)
+    assert done.exit_code == 2 and "not in the range" in done.output
+    helped = run("--help").output
+    assert "diagnose" in helped and "blind" in helped
+    assert "--effects" in run("diagnose", "-h").output
+
+
+def test_the_numbers_of_a_field_are_not_printed(diagnosed: Diagnosed) -> None:
+    report = json.loads((diagnosed.out / "g.json").read_text())
+    fit = report["effects"][0]
+    bumps = {f"unknown.bump_{k}": fit["parameters"]["height"] for k in range(100)}
+    both = fit | {
+        "name": "edge_glow + unknown",
+        "parameters": bumps | {"edge_glow.height": fit["parameters"]["height"]},
+    }
+    report |= {"together": [both, fit | {"name": "unknown", "parameters": bumps}]}
+    report["set"]["members"] = [["edge_glow", "unknown"], ["unknown"]]
+    said = [line for line in _lines(report) if "P = " in line]
+    assert len(said) == 1 and "edge_glow.height" in said[0] and "bump" not in said[0]
+
+
+# --- blind cases ----------------------------------------------------------------------------------------
+
+
+SMALL = ["--size", "128", "--images", "9", "--synthetic", "--processes", "1"]
+
+
+def run_blind(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(main, ["gap", "blind", *[str(argument) for argument in arguments]])
+
+
+def test_a_set_is_made_and_sealed_and_another_is_not_mixed_in(tmp_path: Path) -> None:
+    folder = tmp_path / "set"
+    image = tmp_path / "sun.fits"
+    rng = np.random.default_rng(2)
+    header = fits.Header({"BUNIT": "DN", "XPOSURE": 2.0})
+    fits.PrimaryHDU((400 + 80 * rng.random((300, 300))).astype("f4"), header).writeto(image)
+    made = run_blind("--cases", 1, "--clean-only", "--make-only", "--scenes", image, "-o", folder, *SMALL)
+    assert made.exit_code == 0, made.output
+    assert "1 of 1 cases made and sealed" in made.output
+    assert len((folder / "seals.jsonl").read_text().splitlines()) == 1
+    assert len(list((folder / "cases" / "0000" / "transit").glob("0*.fits"))) == 9
+    other = run_blind("--cases", 1, "--seed", 9, "--clean-only", "--make-only", "-o", folder, *SMALL)
+    assert other.exit_code == 1
+    assert "contains a set that was made" in other.output
+    drawn = run_blind("--cases", 1, "--clean-only", "--make-only", "-o", folder, *SMALL)
+    assert drawn.exit_code == 1, "scenes of that image are not mixed with drawn ones"
+    assert "other-set" not in drawn.output and "contains a set that was made" in drawn.output
+    again = run_blind("--cases", 1, "--clean-only", "--make-only", "--scenes", image, "-o", folder, *SMALL)
+    assert again.exit_code == 0 and "made case" not in again.output
+
+
+def test_bad_input_is_said_in_a_line(subtests: pytest.Subtests, tmp_path: Path) -> None:
+    for arguments, said in (
+        (["--only", "gremlins"], "expected one of anisotropic_scatter"),
+        (["--size", "32"], "--size"),
+        (["--cases", "0"], "--cases"),
+        (["--simulator", "missing.py"], "expected a readable Python file"),
+        (["--simulator", "mine.py", "--only", "ghost"], "expected --simulator without --only"),
+        (["--clean-only", "--only", "ghost"], "expected one of --clean-only and --only"),
+    ):
+        with subtests.test(str((arguments, said))):
+            answer = run_blind("-o", tmp_path / "set", "--make-only", "--processes", "1", *arguments)
+            assert answer.exit_code != 0
+            assert said in answer.output
+            assert "Traceback" not in answer.output
+            assert not (tmp_path / "set" / "cases").exists()
+
+
+def test_where_no_case_can_be_made_that_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def cannot(case: object, *folders: object) -> None:
+        raise DataError("bad-scene", "expected a scene with light for pointing 2; got none")
+
+    monkeypatch.setattr("psfcore.blind.case_set.make", cannot)
+    answer = run_blind("--cases", 2, "--clean-only", "-o", tmp_path / "set", *SMALL)
+    assert answer.exit_code == 1
+    assert "could not make case 0001" in answer.output
+    assert (
+        "none of the 2 cases could be made; the first failed with: bad-scene: expected a scene"
+        in answer.output
+    )
+    assert "Traceback" not in answer.output
+
+
+def test_the_cases_of_a_simulator_are_made_and_sealed(tmp_path: Path) -> None:
+    source = tmp_path / "mine.py"
+    source.write_text(
+        "from tests.transit_files import write_transit\n\n"
+        "def make_case(*, seed, number, size_px, images, transit, expected):\n"
+        "    write_transit(transit, images=images)\n"
+        "    return {'effects': [{'name': 'ghost', 'strength': seed + size_px}]}\n"
+    )
+    size = ["--size", "128", "--images", "9", "--seed", "7"]
+    made = run_blind("--simulator", source, "--cases", 1, "--make-only", "-o", tmp_path / "set", *size)
+    assert made.exit_code == 0, made.output
+    assert "1 of 1 cases made and sealed" in made.output
+    kept = json.loads((tmp_path / "set" / "truth" / "0000.json").read_text())
+    assert kept["truth"]["effects"] == [{"name": "ghost", "strength": 135}]
+
+
+@pytest.mark.slow
+def test_six_cases_from_seal_to_score(tmp_path: Path) -> None:
+    folder = tmp_path / "set"
+    arguments = ["--cases", 6, "--size", 160, "--images", 12, "--synthetic", "--processes", 2, "-o", folder]
+    answer = run_blind(*arguments)
+    assert answer.exit_code == 0, answer.output
+    score = json.loads((folder / "score.json").read_text())
+    assert score["schema"] == "gap-blind/1"
+    assert (score["judged"], score["failures"]) == (6, {})
+    assert {case["case"] for case in score["cases"]} == set(range(6))
+    assert (folder / "score.png").is_file()  # tests of psfcore.blind draw it
+    assert not list(folder.rglob("transit")), "transits go once there are reports"
+    assert not list(folder.rglob("expected"))
+    effects = [
+        path for path in folder.rglob("truth/*.json") if json.loads(path.read_text())["truth"]["effects"]
+    ]
+    assert len(list(folder.rglob("ideal.json"))) == len(effects) > 0
+    assert "false alarms on clean data" in answer.output
+    reports = {path: path.stat().st_mtime_ns for path in folder.rglob("report.json")}
+    assert run_blind(*arguments).exit_code == 0
+    assert {path: path.stat().st_mtime_ns for path in folder.rglob("report.json")} == reports
+
+
+# --- a planned transit ----------------------------------------------------------------------------------
+
+
+FEW = tuple(effect for effect in LIBRARY if effect.name in ("dark_offset", "core_blur"))
+
+
+def run_plan(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(main, ["gap", "plan", *[str(argument) for argument in arguments]])
+
+
+@pytest.fixture
+def plan_file(tmp_path: Path) -> Path:
+    path = tmp_path / "plan.json"
+    path.write_text(json.dumps(default_plan(12, 96, oversampling=1, brightness=6.0).as_json()))
+    return path
+
+
+def test_a_plan_gives_a_table_a_page_and_numbers(
+    plan_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(planning.planned_limits.__kwdefaults__, "library", FEW)
+    known = tmp_path / "known.fits"
+    write_plane(known, diffraction(), cards={})
+    page, numbers = tmp_path / "plan.html", tmp_path / "limits.json"
+    done = run_plan(plan_file, "-o", page, "--json", numbers, "--diffraction", known)
+    assert done.exit_code == 0, done.output
+    content = json.loads(numbers.read_text())
+    offset = content["limits"]["dark_offset"]
+    assert f"offset {offset['found_90']:.3g} DN" in done.output
+    assert set(content["limits"]) == {"dark_offset", "core_blur"}
+    # In a small field the occulter is invisible where it is in front of the dark sky.
+    assert "001.fits" in content["left_out"] and "image not usable: 001.fits" in done.output
+    assert "What a planned transit would show" in page.read_text("utf-8")
+    assert "Images that the fit could not use" in page.read_text("utf-8")
+    again = run_plan(plan_file, "-o", page, "--diffraction", known)
+    assert again.exit_code == 1 and "--overwrite" in again.output
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("{", "expected a plan or a transit.json, as JSON"),
+        (json.dumps({"schema": "transit/1", "images": []}), "images"),
+        (json.dumps(default_plan(2, 96).as_json()), "expected a plan with at least 3 images"),
+    ],
+)
+def test_a_file_that_is_no_plan_is_refused_in_one_line(plan_file: Path, content: str, said: str) -> None:
+    plan_file.write_text(content)
+    done = run_plan(plan_file)
+    assert done.exit_code == 1
+    assert said in done.output and len(done.output.strip().splitlines()) == 1
+
+
+def test_a_plan_that_does_not_exist_is_refused(tmp_path: Path) -> None:
+    done = run_plan(tmp_path / "none.json")
+    assert done.exit_code == 2 and "does not exist" in done.output
