@@ -37,8 +37,7 @@ from psfcore.deconvolve.conditions import Conditions, PreparedPsfs
 from psfcore.deconvolve.methods.registry import method_named, method_names
 from psfcore.image import Image
 from psfcore.psf import Psf
-from psfcore.simulate.observe import observe
-from psfcore.simulate.scene import solar_scene
+from psfcore.simulate.scene import observe, solar_scene
 
 PLAIN, PLAIN_STEPS, MOST_STEPS = "richardson-lucy", 20, 60
 INNER = np.s_[128:-128, 128:-128]

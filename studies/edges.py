@@ -27,8 +27,7 @@ from psfcore.deconvolve.methods.registry import method_named, method_names
 from psfcore.image import Image
 from psfcore.psf import Psf
 from psfcore.scatter.power_law import scatter_kernel
-from psfcore.simulate.observe import observe
-from psfcore.simulate.scene import solar_scene
+from psfcore.simulate.scene import observe, solar_scene
 
 FIELD_PX = 1024
 SCENE_PX = 2048

@@ -17,13 +17,11 @@ from astropy.io.fits import Header
 from scipy.ndimage import uniform_filter
 
 import heliopsf
-from psfcore.deconvolve.box import Box
 from psfcore.deconvolve.conditions import PreparedPsfs
-from psfcore.deconvolve.region import box_work
-from psfcore.deconvolve.whole import Options, Work
+from psfcore.deconvolve.extent import Box
+from psfcore.deconvolve.work import Options, Work, box_work
 from psfcore.image import Image
-from psfcore.simulate.observe import observe
-from psfcore.simulate.scene import solar_scene
+from psfcore.simulate.scene import observe, solar_scene
 from workers.machine import cores
 
 ERRORS = (0.5, 0.2, 0.05, 0.02)

@@ -40,7 +40,6 @@ from numpy.typing import NDArray
 from psfcore.convolution.convolver import Convolver
 from psfcore.errors import DataError
 from psfcore.psf import REACH_GRID_PX, cumulative_curve, encircled_energy
-from psfcore.simulate.disc import fully_dark
 from psfcore.simulate.plan import HIGH
 from psfcore.simulate.scatter_truth import (
     PARAMETERS,
@@ -49,7 +48,7 @@ from psfcore.simulate.scatter_truth import (
     convolved,
     kernel_slopes,
 )
-from psfcore.simulate.sky import TrueSky, on_field
+from psfcore.simulate.sky import TrueSky, fully_dark, on_field
 
 Plane = NDArray[np.float64]
 Kernel = NDArray[np.float64]

@@ -17,7 +17,7 @@ from service.views import ProductView, RowView
 from workers.catalogue.tables import ImageRow, ProductRow
 from workers.contract.requests import Identity
 from workers.files.collection import files_of, remove_unnamed
-from workers.intake.deprecated import details_now
+from workers.intake.compatibility import details_now
 
 router = APIRouter(prefix="/v1/images", tags=["images"], responses=RESPONSES)
 products = APIRouter(prefix="/v1/products", tags=["products"], responses=RESPONSES)

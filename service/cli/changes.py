@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from psfcore.errors import DataError
-from psfcore.whole_files import sha256_of
+from psfcore.files import sha256_of
 from service.cli.connection import LOCAL, PSF, SERVER, connection, named_psf
 from service.cli.fields import options_of
 from service.cli.options import (
@@ -31,7 +31,7 @@ from service.client.outputs import check_output_folder, check_outputs, written
 from workers.contract.requests import Deconvolve
 
 if TYPE_CHECKING:
-    from psfcore.deconvolve.assess.contact_sheet import Treated
+    from psfcore.deconvolve.assess.pictures import Treated
 
 TABLE, SHEET = "changes.json", "contact-sheet.png"
 SHOWN = 20
@@ -63,7 +63,7 @@ def changes(
     Images with the highest artefact score come first. Images that cannot be deconvolved are listed with the reason.
     Each image gets the same PSF and the same treatment as by `heliopsf deconvolve`.
     """
-    from psfcore.deconvolve.assess.contact_sheet import contact_sheet_png, table, treat_many
+    from psfcore.deconvolve.assess.pictures import contact_sheet_png, table, treat_many
 
     files = [str(path) for path in fits_files(images)]
     if not files:
@@ -103,7 +103,7 @@ def _one_by_one(
 ) -> Callable[[str], Treated]:
     """A function that deconvolves one image with the service and measures what changed. The function adds the ids of
     the products to ``products``."""
-    from psfcore.deconvolve.assess.contact_sheet import changes_in_product
+    from psfcore.deconvolve.assess.pictures import changes_in_product
 
     def one(name: str) -> Treated:
         with TemporaryDirectory(prefix="heliopsf-") as folder:

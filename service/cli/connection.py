@@ -21,8 +21,8 @@ from service.cli.options import user_errors
 from service.cli.progress import echo, say
 from service.client.address import DEFAULT_SERVER, SHOWN_DIGITS
 from service.client.operations import Operations
-from workers.cache_folder import published_folder
 from workers.contract.requests import FEWEST_DIGITS, Deconvolve
+from workers.machine import published_folder
 
 if TYPE_CHECKING:
     from service.client.http import Client

@@ -24,10 +24,11 @@ from pydantic import TypeAdapter, ValidationError
 from psfcore import limited
 from psfcore.compiled import listening
 from psfcore.deconvolve import run
-from psfcore.deconvolve.box import Box
 from psfcore.deconvolve.conditions import PreparedPsfs
+from psfcore.deconvolve.extent import Box
 from psfcore.deconvolve.run import BUILDING, Identities, UsedPsf
 from psfcore.errors import DataError, module_of_extra
+from psfcore.files import sha256_of
 from psfcore.fits.blocks import LIMITS
 from psfcore.fits.frame import frame_of
 from psfcore.fits.header import HeaderSummary, check_not_deconvolved, optional_text, read_summary
@@ -41,11 +42,9 @@ from psfcore.instruments.workload import check_workload
 from psfcore.psf import Kernel, Psf, light_beyond_pct
 from psfcore.psf_cache import built_file, kept_psf
 from psfcore.transit.archive import ArchiveContents, list_archive, transit_in, unpack
-from psfcore.whole_files import sha256_of
 from service.client.errors import ServiceError
 from service.client.operations import Operations, Progress, named_instrument
 from service.client.outputs import written
-from workers.cache_folder import psf_cache
 from workers.contract.identities import (
     build_for,
     check_noise,
@@ -72,7 +71,7 @@ from workers.contract.requests import (
 from workers.contract.suggestions import explained
 from workers.files.archive import safe_name
 from workers.intake.costs import COSTS, linear_s
-from workers.machine import cores, free_bytes
+from workers.machine import cores, free_bytes, psf_cache
 from workers.settings import Settings, software_version
 from workers.stage_timer import StageTimer
 from workers.versions import PsfStatus, instrument_of, name_of_upload

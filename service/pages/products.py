@@ -23,7 +23,7 @@ from service.pages.sentences import of_problem
 from service.views import ProductView
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, ReportRow
 from workers.contract.requests import Identity
-from workers.intake.deprecated import CODE, deprecation
+from workers.intake.compatibility import DEPRECATED_CODE, deprecation
 
 MOST_RERUNS = 10
 router = APIRouter(prefix="/products/{product_id}", include_in_schema=False)
@@ -49,7 +49,7 @@ def product(product_id: Identity, request: Request, caller: PageReading, state: 
         psf=psf,
         lost=lost,
         image_lost=image_lost,
-        warnings=_warnings(row.details, without=CODE if deprecated else None),
+        warnings=_warnings(row.details, without=DEPRECATED_CODE if deprecated else None),
         deprecated=deprecated,
         redo=_again(row, psf_id="" if better is None else better.id),
         changed=_changed(row.details),

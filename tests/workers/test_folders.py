@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from psfcore.errors import DataError
-from workers.cache_folder import psf_cache
+from workers.machine import psf_cache
 from workers.settings import Settings
 
 
@@ -39,13 +39,13 @@ def test_a_size_that_is_no_number_is_refused(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_the_module_loads_nothing_else_of_the_workers() -> None:
-    code = "import sys, workers.cache_folder; print('\\n'.join(sys.modules))"
+    code = "import sys, workers.machine; print('\\n'.join(sys.modules))"
     loaded = set(
         subprocess.run(
             [sys.executable, "-c", code], check=True, capture_output=True, text=True
         ).stdout.split()
     )
-    assert {name for name in loaded if name.startswith("workers.")} == {"workers.cache_folder"}
+    assert {name for name in loaded if name.startswith("workers.")} == {"workers.machine"}
     assert loaded & {"pydantic", "sqlalchemy", "numpy", "celery"} == set()
 
 

@@ -28,7 +28,7 @@ from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ImageRow, ProductRow
 from workers.contract.bulk import BulkRequest
 from workers.contract.identities import product_identity
-from workers.contract.phases import JobError
+from workers.contract.jobs import JobError
 from workers.contract.requests import ResolvedDeconvolve
 from workers.files import archive as archive_files
 from workers.intake import estimates

@@ -44,7 +44,7 @@ from workers.catalogue.uws_jobs import UwsJobs
 from workers.catalogue.waiting import Places, Turns
 from workers.contract.bulk import OPEN
 from workers.contract.identities import canonical_hash
-from workers.contract.phases import ENDED, Phase
+from workers.contract.jobs import ENDED, Phase
 from workers.versions import PsfStatus
 
 Row = TypeVar("Row", ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, SolutionRow)

@@ -21,9 +21,8 @@ from sqlalchemy.orm import InstrumentedAttribute, Session, aliased
 from workers.catalogue.database import Queries, insert_into
 from workers.catalogue.tables import JobRow, OwnerTurnRow, TermsRow
 from workers.contract.identities import canonical_hash
+from workers.contract.jobs import LIVE, Fault, JobError, Phase, Queue
 from workers.contract.kinds import queue_of
-from workers.contract.phases import LIVE, Fault, JobError, Phase
-from workers.contract.queues import Queue
 
 log = logging.getLogger(__name__)
 

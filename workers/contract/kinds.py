@@ -23,7 +23,7 @@ from workers.contract.identities import (
     report_identity,
     request_identity,
 )
-from workers.contract.queues import Queue
+from workers.contract.jobs import Queue
 from workers.contract.requests import (
     CrossValidate,
     Deconvolve,
@@ -152,7 +152,7 @@ _ROWS = (
     ),
     Kind(
         "psf-interpolate",
-        task="workers.tasks.interpolation:psf_interpolate",
+        task="workers.tasks.psf_build:psf_interpolate",
         result=Result.PSF,
         parameters=PsfInterpolate,
         resolved=PsfInterpolate,

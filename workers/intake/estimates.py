@@ -20,8 +20,7 @@ from statistics import median_low
 from typing import Any
 from weakref import WeakKeyDictionary
 
-from psfcore.deconvolve.box import EXPECTED_RIM_PX, Box
-from psfcore.deconvolve.memory import MIB, Demand, of_method, product_bytes
+from psfcore.deconvolve.extent import EXPECTED_RIM_PX, MIB, Box, Demand, of_method, product_bytes
 from psfcore.errors import DataError
 from psfcore.instruments.model import parse_instrument
 from psfcore.instruments.workload import workload

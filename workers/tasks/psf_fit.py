@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from psfcore.errors import module_of_extra
 from psfcore.psf import Psf
-from psfcore.scatter.fit import TransitFit, fit_transit, fitted_psf
+from psfcore.scatter.fit import TransitFit, fit_json, fit_transit, fitted_psf
 from psfcore.scatter.inversion import Inverter, Progress
-from psfcore.scatter.report import fit_json
 from psfcore.transit.prepare import Prepared
 from psfcore.transit.transit import Transit
 from workers.contract.identities import diffraction_identity, psf_fit_identity

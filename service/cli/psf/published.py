@@ -9,7 +9,7 @@ import click
 from psfcore.published_psfs import PUBLISHED, get, published
 from service.cli.options import FOLDER, progress_bar, user_errors
 from service.cli.progress import echo
-from workers.cache_folder import published_folder
+from workers.machine import published_folder
 
 NAMES = click.argument("names", metavar="NAME...", nargs=-1, required=True)
 SOURCE = click.option(

@@ -20,7 +20,7 @@ from service.cli.connection import ID_OR_FILE, SERVER_FOR_IDS, is_psf_id, psf_fi
 from service.cli.options import JSON, OUTPUT, psf_limits, user_errors, write_json, writes_files
 from service.cli.progress import echo
 from service.client.outputs import written
-from workers.cache_folder import psf_cache
+from workers.machine import psf_cache
 
 if TYPE_CHECKING:
     from psfcore.psf import Psf

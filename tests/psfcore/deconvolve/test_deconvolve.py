@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from psfcore.fits.observation import read_observation
 from psfcore.image import Image, MaskBit
-from psfcore.simulate.observe import observe
-from psfcore.simulate.scene import solar_scene
+from psfcore.simulate.scene import observe, solar_scene
 from tests.psfcore.conftest import LIMITS, gaussian, make_image, make_psf
 from tests.psfcore.deconvolve.scattering import richardson_lucy, scattering_psf
 

@@ -10,7 +10,7 @@ from astropy.io import fits
 
 from psfcore.deconvolve.doubts import input_warnings
 from psfcore.deconvolve.run import deconvolve
-from psfcore.deconvolve.whole import Options
+from psfcore.deconvolve.work import Options
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.psfs import read_psf
 from psfcore.image import Image

@@ -34,9 +34,8 @@ from workers.broker.order import FolderTransport, MostUrgentFirst
 from workers.broker.reconciler import AT_ONCE, reconcile
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow
+from workers.contract.jobs import Phase, Queue, broker_name, by_urgency, queues_named
 from workers.contract.kinds import KINDS
-from workers.contract.phases import Phase
-from workers.contract.queues import Queue, broker_name, by_urgency, queues_named
 from workers.settings import Settings
 
 

@@ -23,7 +23,7 @@ from workers.contract.identities import psf_identity
 from workers.contract.kinds import JobRequest
 from workers.contract.requests import PsfBuild, PsfFit
 from workers.intake import requests
-from workers.intake.deprecated import details_now
+from workers.intake.compatibility import details_now
 from workers.settings import Settings
 from workers.versions import PsfStatus
 

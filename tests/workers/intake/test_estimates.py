@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from sqlalchemy import delete
 
-from psfcore.deconvolve.memory import MARGIN_SHARE, WORKING_BYTES
+from psfcore.deconvolve.extent import MARGIN_SHARE, WORKING_BYTES
 from psfcore.errors import DataError
 from psfcore.instruments.model import parse_instrument
 from psfcore.instruments.workload import check_workload
@@ -24,7 +24,7 @@ from tests.workers.databases import add, change
 from tests.workers.psf_examples import psf as psf_row
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ImageRow, JobRow, TransitRow
-from workers.contract.phases import Phase
+from workers.contract.jobs import Phase
 from workers.contract.requests import Method, PsfBuild, RichardsonLucy
 from workers.intake import estimates
 from workers.intake.costs import COSTS

@@ -19,8 +19,7 @@ from workers.broker import app as queue
 from workers.broker.reconciler import reconcile
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow
-from workers.contract.phases import Phase
-from workers.contract.queues import Queue
+from workers.contract.jobs import Phase, Queue
 from workers.settings import Settings
 
 LEASE_S, IDLE_S = 3.0, 6.0

@@ -18,7 +18,7 @@ from tests.workers.jobs import job_row
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.parts import Part, Parts
 from workers.catalogue.tables import JobRow, PartRow
-from workers.contract.phases import Phase
+from workers.contract.jobs import Phase
 from workers.files.store import Store
 from workers.run.runner import Runner
 from workers.settings import Settings

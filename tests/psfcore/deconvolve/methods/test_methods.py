@@ -21,8 +21,7 @@ from psfcore.errors import DataError
 from psfcore.image import MaskBit
 from psfcore.noise import Noise
 from psfcore.psf import Psf
-from psfcore.simulate.observe import observe
-from psfcore.simulate.scene import solar_scene
+from psfcore.simulate.scene import observe, solar_scene
 from studies import edges as edge_study
 from tests.psfcore.conftest import delta, gaussian, make_image, make_psf
 from tests.psfcore.deconvolve.scattering import scattering_psf
