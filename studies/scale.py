@@ -25,7 +25,7 @@ from typing import Any
 
 from sqlalchemy import Engine, event, func, insert, select, text
 
-from studies.pages import with_part
+from benchmarks.figures import with_part
 from workers.bulk.dry_run import product_bytes
 from workers.bulk.listing import MOST_IMAGES
 from workers.bulk.runs import KIND, MOST_TURNS, begin, keep_turns

@@ -1,7 +1,4 @@
-"""Comparison of two arrays: equal, close, far apart, and of different shapes.
-
-The scaled inverse is the inverse for any units; undetermined directions get no variance.
-"""
+"""Comparison of two arrays that are equal, close, far apart or of different shapes; the scaled inverse for any units."""
 
 from __future__ import annotations
 

@@ -23,9 +23,8 @@ from workers.catalogue.census import Census, KeptStageTimes
 from workers.catalogue.contexts import Contexts, Series
 from workers.catalogue.database import Database, begins_with, newest_first
 from workers.catalogue.followed import followed_bulks, followed_jobs
-from workers.catalogue.jobs import Jobs
+from workers.catalogue.jobs import Jobs, Parts
 from workers.catalogue.owners import NamedFiles, Owners, hold_to_quota, lock_owner
-from workers.catalogue.parts import Parts
 from workers.catalogue.psfs import Psfs, existing_psf
 from workers.catalogue.schema import Schema
 from workers.catalogue.tables import (

@@ -152,7 +152,7 @@ _ROWS = (
     ),
     Kind(
         "psf-interpolate",
-        task="workers.tasks.psf_build:psf_interpolate",
+        task="workers.tasks.interpolation:psf_interpolate",
         result=Result.PSF,
         parameters=PsfInterpolate,
         resolved=PsfInterpolate,

@@ -35,7 +35,7 @@ from workers.tasks.results import Finished, keep_report, provenance_of, report_m
 from workers.tasks.transits import load_transit, solved
 
 if TYPE_CHECKING:
-    from workers.catalogue.parts import Part
+    from workers.catalogue.jobs import Part
     from workers.tasks.context import Context
 
 _PLOT = "psfcore.scatter.plots"

@@ -1,14 +1,9 @@
-"""The tasks ``psf-build``, ``psf-interpolate`` and ``psf-tables``.
-
-The first builds a PSF version from an instrument file. The second interpolates between two fitted PSFs in time; the result
-is a PSF with its errors. The third makes the tables and the picture of a PSF that has none yet, for example an uploaded PSF.
-"""
+"""The tasks ``psf-build``, which builds a PSF version from an instrument file, and ``psf-tables``, which makes the tables and the
+picture of a PSF that has none yet, for example an uploaded PSF."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
-from datetime import datetime
 from functools import partial
 from typing import Any
 
@@ -19,19 +14,13 @@ from psfcore.errors import DataError
 from psfcore.fits.images import read_plane
 from psfcore.fits.psfs import read_psf
 from psfcore.instruments.model import Instrument, parse_instrument
-from psfcore.psf import Psf, cumulative_curve
-from psfcore.scatter.interpolation import Epoch, curve_sigma, interpolated_psf, parameters_of
-from psfcore.scatter.total_psf import CURVE_RADII_PX
 from workers.catalogue.tables import PsfRow
 from workers.contract.identities import interpolated_psf_identity, recipe_of
 from workers.contract.requests import PsfBuild, PsfInterpolate, PsfTables, ResolvedDeconvolve
-from workers.intake.compatibility import of_upload
 from workers.settings import library_versions
 from workers.tasks.context import Context
-from workers.tasks.results import keep_psf, keep_tables, named_psf, provenance_of
-from workers.versions import INTERPOLATED, TOTAL, interpolated_name
-
-STAGE = "interpolating the PSF"
+from workers.tasks.results import keep_psf, keep_tables, named_psf
+from workers.versions import TOTAL
 
 
 def psf_build(context: Context, parameters: Mapping[str, Any]) -> str:
@@ -44,7 +33,7 @@ def requested_psf(context: Context, request: ResolvedDeconvolve) -> PsfRow:
     from its recipe, or interpolated between two PSFs, if the request says how.
 
     Raises DataError "no-such-psf", "instrument-changed" if the recipe now gives another PSF, "interpolation-changed" if
-    this version interpolates in another way, and the errors of ``workers.tasks.psf_build``.
+    this version interpolates in another way, and the errors of ``workers.tasks.interpolation``.
     """
     if request.psf_recipe is None and request.psf_interpolation is None:
         return named_psf(context, request.psf_id)
@@ -72,6 +61,7 @@ def _interpolated(context: Context, psf_id: str, asked: PsfInterpolate) -> PsfRo
             "way: submit the job again",
         )
     # A deconvolution with another PSF does not load what an interpolation needs.
+    from workers.tasks.interpolation import interpolated_row
 
     return interpolated_row(context, asked)
 
@@ -148,87 +138,3 @@ def psf_tables(context: Context, parameters: Mapping[str, Any]) -> str:
         row.id, context.owner, tables_sha256=tables_sha256, preview_sha256=preview_sha256
     )
     return row.id
-
-
-def psf_interpolate(context: Context, parameters: Mapping[str, Any]) -> str:
-    """Interpolate between two PSFs of the catalogue, and add the new PSF to it; returns the PSF's id."""
-    return interpolated_row(context, PsfInterpolate.model_validate(parameters)).id
-
-
-def interpolated_row(context: Context, request: PsfInterpolate) -> PsfRow:
-    """The row of the interpolated PSF. If the catalogue does not contain this PSF, it is made and added.
-
-    Raises DataError "no-such-psf", and the errors of ``psfcore.scatter.interpolation.interpolated_psf``.
-    """
-    identity = interpolated_psf_identity(request)
-    made = context.made(PsfRow, identity)
-    if made is not None:
-        return made
-    from psfcore.drawing.plots import psf_png  # matplotlib is loaded only if a picture is drawn
-
-    context.report(STAGE, 0, 2)
-    ends = {
-        "before": _epoch(context, request.before_psf_id, request.before_time),
-        "after": _epoch(context, request.after_psf_id, request.after_time),
-    }
-    name, version = interpolated_name(ends["before"].psf.instrument, identity)
-    # The id of the job is in the details of the row, not in the file, so that the file can be made again bit for bit.
-    provenance = {"psf_id": identity, **provenance_of(context.job_id, request)}
-    del provenance["job_id"]
-    psf = interpolated_psf(
-        ends["before"],
-        ends["after"],
-        datetime.fromisoformat(request.time),
-        name=name,
-        version=version,
-        provenance=provenance,
-        threads=context.settings.threads,
-    )
-    context.report(STAGE, 1, 2)
-    parents = psf.provenance["interpolated_between"]
-    return keep_psf(
-        context,
-        psf,
-        identity,
-        origin=INTERPOLATED,
-        draw=partial(psf_png, psf),
-        # The files of the ends do not name the variant of the channel; their rows do.
-        channel=named_psf(context, request.before_psf_id).channel,
-        details={
-            "parents": {name: end["psf_id"] for name, end in zip(("before", "after"), parents, strict=True)},
-            "weights": {end["psf_id"]: end["weight"] for end in parents},
-            "job_id": context.job_id,
-            "fit": _fit_of(psf, context.settings.threads),
-        },
-    )
-
-
-def _epoch(context: Context, psf_id: str, time: str) -> Epoch:
-    """A PSF of the catalogue, and the time at which it holds."""
-    row = named_psf(context, psf_id)
-    psf = read_psf(context.store.verified(row.file_sha256), context.settings.psf_limits)
-    # The request of an upload or of a certification may give an instrument and a channel that the file does not contain.
-    instrument, angstrom = of_upload(row, psf.instrument, psf.wavelength_angstrom)
-    psf = replace(
-        psf, name=row.name, version=row.version, instrument=instrument, wavelength_angstrom=angstrom
-    )
-    return Epoch(psf, datetime.fromisoformat(time), {"psf_id": row.id, "file_sha256": row.file_sha256})
-
-
-def _fit_of(psf: Psf, threads: int) -> dict[str, Any]:
-    """The parameters and the curve with their errors, in the form of the details of a fitted PSF."""
-    assert psf.fitted is not None
-    radii = np.array([radius for radius in CURVE_RADII_PX if radius < psf.kernel.shape[0] // 2])
-    curve, sigma = cumulative_curve(psf.kernel, radii), curve_sigma(psf, radii, threads=threads)
-    before, after = psf.provenance["interpolated_between"]
-    return {
-        "sentence": f"Interpolated to {psf.provenance['interpolated_at']} between {before['name']} {before['version']} (weight "
-        f"{before['weight']:.3f}) and {after['name']} {after['version']} (weight {after['weight']:.3f}).",
-        "shape": psf.fitted.shape,
-        "parameters": parameters_of(psf.fitted),
-        "curve": {
-            "radii_px": radii.tolist(),
-            "light_beyond_pct": curve.tolist(),
-            "sigma": sigma.tolist(),
-        },
-    }

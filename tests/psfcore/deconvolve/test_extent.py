@@ -1,7 +1,4 @@
-"""The memory of a deconvolution: the sizes that it is estimated from, and what is refused.
-
-The cache of prepared PSFs: made once, equal to uncached ones, bounded in size.
-"""
+"""The memory of a deconvolution: the sizes that it is estimated from, what is refused, and the cache of prepared PSFs."""
 
 from __future__ import annotations
 
