@@ -442,11 +442,9 @@ class Local(Operations):
     def _psf_fit(self, request: ResolvedPsfFit, job_id: str, report: _Report) -> str:
         from psfcore.fits.psfs import write_psf
         from workers.tasks import psf_fit
-        from workers.tasks.results import write_json
+        from workers.tasks.results import Means, write_json
 
-        fitted = psf_fit.fit(
-            request, *self._transit(request, report), job_id=job_id, threads=cores(), progress=report
-        )
+        fitted = psf_fit.fit(request, *self._transit(request, report), Means(job_id, cores(), report))
         return self._add_psf(
             fitted.psf,
             fitted.psf.provenance["psf_id"],
@@ -481,24 +479,23 @@ class Local(Operations):
 
     def _report(self, request: ResolvedReport, job_id: str, report: _Report) -> str:
         from workers.tasks import report as task
+        from workers.tasks.results import Means
 
         psf = None if request.psf_id is None else self._psf(request.psf_id, parts=True)
         transit = self._transit(request, report, None if psf is None else task.point())
-        return self._add_report(
-            task.make(request, *transit, psf, job_id=job_id, threads=cores(), progress=report)
-        )
+        return self._add_report(task.make(request, *transit, psf, Means(job_id, cores(), report)))
 
     def _gap_diagnose(self, request: ResolvedGapDiagnose, job_id: str, report: _Report) -> str:
         from psfcore.fits.psfs import write_psf
         from psfcore.gap.library.registry import added_effects
         from workers.tasks.gap import diagnosis_of
+        from workers.tasks.results import Means
 
         added = added_effects(request.added_effects)
         parent = None if request.psf_id is None else self._psf(request.psf_id, parts=True)
         transit, _ = self._transit(request, report)
-        found, corrected = diagnosis_of(
-            request, transit, parent, added, job_id=job_id, threads=cores(), progress=report
-        )
+        means = Means(job_id, cores(), report)
+        found, corrected = diagnosis_of(request, transit, parent, added, means)
         if corrected is not None:
             address = f"/v1/psfs/{corrected.provenance['psf_id']}"
             self._add(address, {}, file=lambda path: write_psf(path, corrected))
