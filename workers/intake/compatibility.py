@@ -1,8 +1,7 @@
 """Checks before a job is queued: whether an image, a PSF and the options fit each other, and whether the PSF is deprecated.
 
 These checks use the header cards that the catalogue stores. The job repeats them, with the same functions, on the
-headers of the files. Earlier versions did not store these cards; for files that were uploaded to such a version, only
-the job makes the checks.
+headers of the files.
 
 The service never chooses a deprecated PSF by itself, and a product that was made with one has a warning. A context
 still uses the PSFs that it pins, even if they were deprecated later. So its results stay reproducible.
