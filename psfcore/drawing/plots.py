@@ -9,7 +9,7 @@ import textwrap
 from collections.abc import Iterator, Sequence
 from io import BytesIO
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -47,11 +47,22 @@ INK = "#222222"
 
 Plane = NDArray[np.floating]
 Vector = NDArray[np.float64]
+Place = tuple[float, float, float, float]  # left, bottom, width and height, as fractions of the figure
 
 NEAREST_PX, FARTHEST_PX = 0.5, REACH_GRID_PX / 2
 POINTINGS = ("#1b4f8a", "#c2402f", "#2b8a6e", "#7b3fa0", "#8a6d00", "#5b5b5b")
 _MANY_IMAGES = 60  # with this many images or more, markers are smaller
 _LETTERS_AN_INCH = 11.5
+
+
+class Panel(NamedTuple):
+    """An image to draw. beyond: the ends of the colour bar, beyond which there are values: "max" or "both"."""
+
+    title: str
+    pixels: Plane
+    colours: Colormap
+    norm: Normalize
+    beyond: str
 
 
 def write_png(figure: Figure, target: str | Path | IO[bytes], **options: Any) -> None:
@@ -110,31 +121,48 @@ def preview_figure(before: Plane, after: Plane, *, title: str, unit: str) -> Fig
 
     unit: unit of the pixels, see `psfcore.fits.units`.
     """
-    step = max(1, -(-max(before.shape) // PANEL_PX))
-    small_before, small_after = binned(before, step), binned(after, step)
-    stretch = square_root_stretch(small_before, small_after)
-    change = change_pct(small_before, small_after)
     figure = Figure(figsize=(15.6, 5.55), dpi=100, facecolor="white")
     figure.text(0.045, 0.955, title, fontsize=13, color=INK, va="center", weight="bold")
-    extent = (-0.5, before.shape[1] - 0.5, -0.5, before.shape[0] - 0.5)
-    panels: list[tuple[str, Plane, Colormap, Normalize, str]] = [
-        ("Before", small_before, GOLD, stretch, unit),
-        ("After", small_after, GOLD, stretch, unit),
-        ("Change", change, CHANGE, Normalize(-CHANGE_LIMIT_PCT, CHANGE_LIMIT_PCT), "% of before"),
+    places = [(0.045 + 0.318 * index, 0.085, 0.266, 0.79) for index in range(3)]
+    draw_panels(figure, compared_panels(before, after, unit), places, before.shape)
+    return figure
+
+
+def compared_panels(before: Plane, after: Plane, unit: str) -> list[Panel]:
+    """The panels of an image before and after (same stretch), and of the change in percent; each at most PANEL_PX wide."""
+    step = max(1, -(-max(before.shape) // PANEL_PX))
+    before, after = binned(before, step), binned(after, step)
+    stretch = square_root_stretch(before, after)
+    limits_pct = Normalize(-CHANGE_LIMIT_PCT, CHANGE_LIMIT_PCT)
+    return [
+        Panel(f"Before ({unit})", before, GOLD, stretch, "max"),
+        Panel(f"After ({unit})", after, GOLD, stretch, "max"),
+        Panel("Change (% of before)", change_pct(before, after), CHANGE, limits_pct, "both"),
     ]
-    for index, (name, data, colours, norm, label) in enumerate(panels):
-        axes = figure.add_axes((0.045 + 0.318 * index, 0.085, 0.266, 0.79))
+
+
+def draw_panels(
+    figure: Figure, panels: Sequence[Panel], places: Sequence[Place], shape: tuple[int, ...]
+) -> None:
+    """Draw panels, three in a row, each with a colour bar. shape: of the image in pixels, for the axes."""
+    extent = (-0.5, shape[1] - 0.5, -0.5, shape[0] - 0.5)
+    for index, (panel, place) in enumerate(zip(panels, places, strict=True)):
+        axes = figure.add_axes(place)
         drawn = axes.imshow(
-            data, origin="lower", cmap=colours, norm=norm, extent=extent, interpolation="nearest"
+            panel.pixels,
+            origin="lower",
+            cmap=panel.colours,
+            norm=panel.norm,
+            extent=extent,
+            interpolation="nearest",
         )
-        axes.set_title(f"{name} ({label})", fontsize=11, color=INK, loc="left")
+        axes.set_title(panel.title, fontsize=11, color=INK, loc="left")
         axes.set_xlabel("x (px)")
-        if index == 0:
+        if index % 3 == 0:
             axes.set_ylabel("y (px)")
         else:
             axes.set_yticks([])
-        colourbar(figure, axes, drawn, beyond="both" if name == "Change" else "max")
-    return figure
+        colourbar(figure, axes, drawn, beyond=panel.beyond)
 
 
 def psf_png(psf: Psf, path: str | Path) -> None:

@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 from psfcore.arrays import json_attributes
 from psfcore.convolution.convolver import Convolver
 from psfcore.psf import (
+    CURVE_RADII_PX,
     REACH_GRID_PX,
     FittedShape,
     Psf,
@@ -51,7 +52,7 @@ from psfcore.scatter.inversion import Inverter, solution_of
 from psfcore.scatter.reconstruction import Inversion, Progress, Solution
 from psfcore.scatter.segments import Segments, beyond_pct, segment_sums, shells_as_published
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Vector, shape_named, stretch_of
-from psfcore.scatter.total_psf import CURVE_RADII_PX, Blur, curve_sigma, pick
+from psfcore.scatter.total_psf import Blur, curve_sigma, pick
 from psfcore.scatter.validation.cross_validation import LIMITS, limits_json
 from psfcore.scatter.validation.robustness import ComparedShape, compare_shapes
 from psfcore.transit.first_guess import FirstGuess, first_guess

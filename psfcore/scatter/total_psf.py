@@ -53,14 +53,13 @@ from psfcore.deconvolve.assess.error_planes import sigma_points
 from psfcore.deconvolve.methods.linear import inverse_filter
 from psfcore.errors import DataError
 from psfcore.noise import Noise
-from psfcore.psf import REACH_GRID_PX, FittedShape, Psf, encircled_energy
+from psfcore.psf import CURVE_RADII_PX, REACH_GRID_PX, FittedShape, Psf, encircled_energy
 from psfcore.psf_sampling import psf_for_image
 from psfcore.scatter.shapes import Shape, Vector, shape_named
 from psfcore.transit.transit import Frame
 
 Kernel = NDArray[np.float64]
 DIFFRACTION, SCATTER = "DIFFRACTION", "SCATTER"
-CURVE_RADII_PX = (0.5, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 300.0)
 Lanes = NDArray[np.float32]
 Pixels = tuple[NDArray[np.intp], NDArray[np.intp]]  # (rows, columns) of single pixels
 STEPS = 5

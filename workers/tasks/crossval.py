@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from psfcore.errors import module_of_extra
+from psfcore.psf import CURVE_RADII_PX
 from psfcore.scatter.reconstruction import Solution
 from psfcore.scatter.shapes import shape_named
-from psfcore.scatter.total_psf import CURVE_RADII_PX
 from psfcore.scatter.validation.cross_validation import (
     NEAR_CENTRE_PX,
     PARTING_SIGMAS,

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.colors import Colormap, LogNorm, Normalize, SymLogNorm
+from matplotlib.colors import LogNorm, Normalize, SymLogNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -24,9 +24,12 @@ from psfcore.drawing.plots import (
     CHANGE_LIMIT_PCT,
     GOLD,
     INK,
+    Panel,
+    Place,
     binned,
     change_pct,
-    colourbar,
+    compared_panels,
+    draw_panels,
     square_root_stretch,
     write_png,
 )
@@ -36,7 +39,6 @@ from psfcore.fits.header import FitsLimits
 from psfcore.fits.images import read_planes
 from psfcore.fits.observation import read_observation
 
-PANEL_PX = 640
 _HISTOGRAM_BLOCK_PX = 4
 _RATIO_MARKS = (0.1, 0.2, 0.3, 0.5, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.5, 2.0, 3.0, 5.0, 10.0)
 _BEFORE, _AFTER = "#1f6fb4", "#d5642f"
@@ -61,36 +63,21 @@ def changes_png(
 
     before, after: pixels [y, x] in `unit`; row 0 is drawn at the bottom. changes: the numbers below the panels.
     """
-    step = max(1, -(-max(before.shape) // PANEL_PX))
-    old, new = binned(before, step), binned(after, step)
-    stretch = square_root_stretch(old, new)
+    panels = compared_panels(before, after, unit)
+    old, new = panels[0].pixels, panels[1].pixels
     difference = new - old
     limit = max(_largest(difference), 1e-12)
     ratio = np.divide(new, old, out=np.full(old.shape, np.nan), where=old > 0)
     ratio = np.where(ratio > 0, ratio, np.nan)
     span = max(1.1, 2 ** _largest(np.log2(ratio)))
-    panels: list[tuple[str, Plane, Colormap, Normalize, str]] = [
-        (f"Before ({unit})", old, GOLD, stretch, "max"),
-        (f"After ({unit})", new, GOLD, stretch, "max"),
-        ("Change (% of before)", change_pct(old, new), CHANGE, Normalize(-CHANGE_LIMIT_PCT, CHANGE_LIMIT_PCT), "both"),
-        (f"After - before ({unit})", difference, CHANGE, SymLogNorm(limit / 30, vmin=-limit, vmax=limit), "both"),
-        ("After / before", ratio, CHANGE, LogNorm(1 / span, span), "both"),
-    ]  # fmt: skip
+    ends = SymLogNorm(limit / 30, vmin=-limit, vmax=limit)
+    panels += [
+        Panel(f"After - before ({unit})", difference, CHANGE, ends, "both"),
+        Panel("After / before", ratio, CHANGE, LogNorm(1 / span, span), "both"),
+    ]
     figure = Figure(figsize=(15.6, 11.1), dpi=100, facecolor="white")
     figure.text(0.045, 0.977, title, fontsize=13, color=INK, va="center", weight="bold")
-    extent = (-0.5, before.shape[1] - 0.5, -0.5, before.shape[0] - 0.5)
-    for index, (name, data, colours, norm, beyond) in enumerate(panels):
-        axes = figure.add_axes(_place(index))
-        drawn = axes.imshow(
-            data, origin="lower", cmap=colours, norm=norm, extent=extent, interpolation="nearest"
-        )
-        axes.set_title(name, fontsize=11, color=INK, loc="left")
-        axes.set_xlabel("x (px)")
-        if index % 3 == 0:
-            axes.set_ylabel("y (px)")
-        else:
-            axes.set_yticks([])
-        colourbar(figure, axes, drawn, beyond=beyond)
+    draw_panels(figure, panels, [_place(index) for index in range(5)], before.shape)
     marks = [mark for mark in _RATIO_MARKS if 1 / span <= mark <= span]
     ratio_bar = figure.axes[-1]
     ratio_bar.set_yticks(marks, [f"{mark:g}" for mark in marks])
@@ -101,7 +88,7 @@ def changes_png(
     write_png(figure, path, pil_kwargs={"compress_level": 3})
 
 
-def _place(index: int) -> tuple[float, float, float, float]:
+def _place(index: int) -> Place:
     row, column = divmod(index, 3)
     return 0.045 + 0.318 * column, 0.555 - 0.465 * row, 0.266, 0.38
 
