@@ -24,7 +24,6 @@ BENCHMARKS: dict[str, tuple[str, ...]] = {
     "times": (),
     "bulk": ("--images", "48", "--steps", "20"),
     "viewer": (),
-    "accelerated": ("--size", "512"),
     "growth": ("--quick",),
 }
 

@@ -31,12 +31,12 @@ from benchmarks.figures import tell
 from psfcore.build import build_psf
 from psfcore.deconvolve.conditions import PreparedPsfs
 from psfcore.deconvolve.run import deconvolve
-from psfcore.deconvolve.whole import Options
+from psfcore.deconvolve.work import Options
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.observation import read_observation
 from psfcore.fits.psfs import read_psf, write_psf
 from psfcore.instruments.model import load_instrument
-from psfcore.simulate.observe import demo_image
+from psfcore.simulate.scene import demo_image
 from tests.whole.stack import items, served
 from workers.settings import Settings
 

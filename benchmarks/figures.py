@@ -1,4 +1,4 @@
-"""The figures that `make bench` compares with their goals and with their stored values.
+"""The figures that `make bench` compares with their goals and with their stored values, and the parts of pages that programs write.
 
 A benchmark states a figure by its name with `tell`. `python -m benchmarks` collects the figures of all benchmarks and
 prints the table. `benchmarks/stored.json` has the values of an earlier run on each kind of machine. Times are compared as
@@ -161,3 +161,20 @@ def table(figures: Iterable[Figure], earlier: Mapping[str, Mapping[str, Any]]) -
             )
     lines += [f"not measured: {name}" for name in WANTED if name not in found]
     return "\n".join(lines)
+
+
+def with_part(page: str, name: str, part: str) -> str:
+    """The page with a new part between the comments `begin NAME` and `end NAME`. Raises ValueError if it does not have them."""
+    begin, end = f"<!-- begin {name} -->\n", f"<!-- end {name} -->\n"
+    before, found, rest = page.partition(begin)
+    _, there, after = rest.partition(end)
+    if not (found and there):
+        raise ValueError(
+            f"expected the lines {begin.strip()} and {end.strip()} in the page; they are not there"
+        )
+    return f"{before}{begin}\n{part.strip()}\n\n{end}{after}"
+
+
+def write_part(path: Path, name: str, part: str) -> None:
+    """Replace the part of a page, as `with_part` does."""
+    path.write_text(with_part(path.read_text("utf-8"), name, part), "utf-8")

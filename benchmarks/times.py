@@ -33,10 +33,9 @@ from psfcore.drawing.plots import preview_png
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.observation import read_observation
 from psfcore.instruments.model import Instrument, load_instrument
-from psfcore.scatter.fit import fit_transit
-from psfcore.scatter.report import fit_sentence
-from psfcore.simulate.observe import demo_image
+from psfcore.scatter.fit import fit_sentence, fit_transit
 from psfcore.simulate.plan import default_plan
+from psfcore.simulate.scene import demo_image
 from psfcore.simulate.transit import simulate, write
 from psfcore.transit.folder import read_transit
 from tests.transit_files import drawn_truth, hri_diffraction

@@ -18,14 +18,14 @@ from heliopsf.inputs import box_of, cut, header_of, image_of, is_many, is_sequen
 from heliopsf.outputs import Deconvolution, in_form_of
 from heliopsf.parameters import NoiseFigures, Number, Progress, Steps, noise_of, number, reporter, whole
 from heliopsf.psfs import AnyPsf, Psf, built_psf, given_psf
-from psfcore.deconvolve.box import LARGEST_ERROR
 from psfcore.deconvolve.camera_noise import measured_noise
 from psfcore.deconvolve.conditions import PreparedPsfs
 from psfcore.deconvolve.doubts import input_warnings
 from psfcore.deconvolve.edges import Edges
+from psfcore.deconvolve.extent import LARGEST_ERROR
 from psfcore.deconvolve.methods.registry import properties_of
 from psfcore.deconvolve.run import BUILDING, DECONVOLVING, read_and_deconvolve
-from psfcore.deconvolve.whole import Options
+from psfcore.deconvolve.work import Options
 from psfcore.errors import DataError, DataWarning
 from psfcore.fits.frame import frame_of
 from psfcore.fits.header import seen_by

@@ -19,7 +19,7 @@ from psfcore.drawing.plots import (
     preview_figure,
     square_root_stretch,
 )
-from psfcore.drawing.units import unit_label
+from psfcore.fits.units import unit_label
 from psfcore.psf import Psf, crop_centred, cumulative_curve
 
 if TYPE_CHECKING:

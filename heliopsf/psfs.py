@@ -15,6 +15,7 @@ from astropy import units
 from heliopsf.parameters import Progress, Steps, radii_px, reporter, whole
 from psfcore.deconvolve.run import BUILDING
 from psfcore.errors import DataError, MissingExtra, did_you_mean, module_of_extra
+from psfcore.files import sha256_of
 from psfcore.fits import psfs
 from psfcore.fits.blocks import LIMITS
 from psfcore.fits.header import utc_time
@@ -28,9 +29,7 @@ from psfcore.psf_sampling import rebinned
 from psfcore.published_psfs import PUBLISHED, kept_file
 from psfcore.recipe import Recipe
 from psfcore.scatter.interpolation import Epoch, interpolated_psf
-from psfcore.whole_files import sha256_of
-from workers.cache_folder import psf_cache, published_folder
-from workers.machine import cores
+from workers.machine import cores, psf_cache, published_folder
 
 if TYPE_CHECKING:
     from astropy.time import Time

@@ -24,6 +24,7 @@ from psfcore.instruments.files import PLATE_SCALE_TOLERANCE as PLATE_SCALE_TOLER
 from psfcore.recipe import REACH_GRID_PX as REACH_GRID_PX
 
 SHOWN_RADII_PX = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+CURVE_RADII_PX = (0.5, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 300.0)
 Kernel = NDArray[np.float64]
 
 LARGEST_SUM = 1 + 1e-3

@@ -25,8 +25,8 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from psfcore.errors import DataError
+from psfcore.files import PARTIAL, sha256_of
 from psfcore.recipe import Recipe
-from psfcore.whole_files import PARTIAL, sha256_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

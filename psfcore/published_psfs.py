@@ -21,8 +21,8 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from psfcore.errors import DataError, did_you_mean, module_of_extra
+from psfcore.files import sha256_of
 from psfcore.fits.blocks import LIMITS
-from psfcore.whole_files import sha256_of
 
 if TYPE_CHECKING:
     from psfcore.psf import Psf

@@ -24,9 +24,8 @@ from service.http.problems import RESPONSES, Problem, ProblemDocument
 from service.http.state import Shared, State
 from workers import checks
 from workers.catalogue.census import JobTally
+from workers.contract.jobs import Phase, Queue
 from workers.contract.kinds import KINDS
-from workers.contract.phases import Phase
-from workers.contract.queues import Queue
 from workers.settings import software_version
 
 OK = "ok"

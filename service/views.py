@@ -9,9 +9,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from psfcore.noise import NoiseFigures
 from workers.catalogue.tables import JobRow, ProductRow, PsfRow, ReportRow, TransitRow
+from workers.contract.jobs import JobError, Phase, Queue
 from workers.contract.kinds import KINDS
-from workers.contract.phases import JobError, Phase
-from workers.contract.queues import Queue
 from workers.versions import PsfStatus, iso
 
 

@@ -29,7 +29,7 @@ import httpx
 from sqlalchemy import URL, Row, create_engine, text
 from sqlalchemy.exc import OperationalError
 
-from psfcore.whole_files import sha256_of
+from psfcore.files import sha256_of
 from tests.conftest import write_image, write_psf
 from tests.whole.stack import QUICK, Missing, free_port, wait_for
 

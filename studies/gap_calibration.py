@@ -33,6 +33,7 @@ from psfcore.blind.judged import required_causes
 from psfcore.blind.score import wilson
 from psfcore.build import known_diffraction
 from psfcore.errors import DataError
+from psfcore.files import write_whole
 from psfcore.gap.evidence.effect_fits import fit_effects
 from psfcore.gap.evidence.expected_gap import linear_model_of
 from psfcore.gap.evidence.fields import Field
@@ -58,7 +59,6 @@ from psfcore.gap.verdict.refits import Refits, settled_posterior
 from psfcore.gap.view import View
 from psfcore.scatter.inversion import invert
 from psfcore.transit.folder import read_transit
-from psfcore.whole_files import write_whole
 
 KINDS = ("clean", "single", "pair", "unknown", "mixed")
 FITTED: tuple[Kind, ...] = ("single", "unknown", "mixed")  # kinds whose prior probabilities are fitted

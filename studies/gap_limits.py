@@ -21,6 +21,7 @@ import numpy as np
 from heliopsf.psfs import LIMITS
 from psfcore.blind.score import wilson
 from psfcore.errors import DataError
+from psfcore.files import write_whole
 from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.expected_gap import linear_model_of
 from psfcore.gap.evidence.linear_model import LinearModel
@@ -37,7 +38,6 @@ from psfcore.simulate.plan import default_plan
 from psfcore.simulate.scatter_truth import ScatterTruth
 from psfcore.simulate.transit import simulate
 from psfcore.transit.transit import Transit
-from psfcore.whole_files import write_whole
 
 EFFECTS = (
     "dark_offset", "intensity_gradient", "gain_mismatch", "nonlinearity", "column_smear",

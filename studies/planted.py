@@ -34,7 +34,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from psfcore.whole_files import write_whole
+from psfcore.files import write_whole
 
 ROOT = Path(__file__).parents[1]
 FAILURE = re.compile(r"^(?:FAILED|ERROR) (\S+?::[^\[\n]+?(?:\[.*?\])?)(?: - .*)?$", re.MULTILINE)
@@ -73,11 +73,11 @@ FAULTS = (
           'np.float32((read_noise / domain.scale) ** 2)', 'np.float32(read_noise / domain.scale)'),
     Fault("deconvolve-same-noise-in-every-draw", "psfcore/deconvolve/assess/error_planes.py",
           'np.random.default_rng([seed, k])', 'np.random.default_rng(seed)'),
-    Fault("deconvolve-near-masked-radius-short", "psfcore/deconvolve/assess/quality.py",
+    Fault("deconvolve-near-masked-radius-short", "psfcore/deconvolve/assess/changes.py",
           'if dy**2 + dx**2 <= radius_px**2', 'if dy**2 + dx**2 < radius_px**2'),
-    Fault("deconvolve-region-shares-inverted", "psfcore/deconvolve/region.py",
+    Fault("deconvolve-region-shares-inverted", "psfcore/deconvolve/work.py",
           '* light.kept - light.light) / light.shares', '* light.kept - light.light) * light.shares'),
-    Fault("fits-saturation-level-itself-unmasked", "psfcore/fits/saturation.py",
+    Fault("fits-saturation-level-itself-unmasked", "psfcore/fits/observation.py",
           'mask[image.pixels >= level]', 'mask[image.pixels > level]'),
     Fault("fits-psf-centre-half-a-pixel-off", "psfcore/fits/psfs.py",
           '(size // 2 + 1.0, ', '(size / 2 + 0.5, '),

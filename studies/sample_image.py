@@ -14,7 +14,7 @@ from astropy.io import fits
 
 from psfcore.build import build_psf
 from psfcore.instruments.model import load_instrument
-from psfcore.simulate.observe import demo_image
+from psfcore.simulate.scene import demo_image
 
 SIZE_PX, PSF_PX, SEED = 512, 1024, 4
 QUANTIZE = 1  # levels in one standard deviation of the noise; the dither keeps means unbiased

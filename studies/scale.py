@@ -17,7 +17,7 @@ import math
 import os
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
@@ -25,7 +25,8 @@ from typing import Any
 
 from sqlalchemy import Engine, event, func, insert, select, text
 
-from studies.pages import with_part
+from benchmarks.figures import with_part
+from benchmarks.timing import seconds
 from workers.bulk.dry_run import product_bytes
 from workers.bulk.listing import MOST_IMAGES
 from workers.bulk.runs import KIND, MOST_TURNS, begin, keep_turns
@@ -44,6 +45,7 @@ FOLDERS = 256  # folders of the store
 SCRAPE_S = 10.0  # the default time limit of Prometheus for /metrics
 SLOW_S, SLOW = 600.0, 0.1  # a slow store has a tenth of its bandwidth in the first ten minutes of each hour
 FEW, MANY, COPIES = 4, 20, 50_000  # images of the two small runs, and copies of their rows
+ROUNDS = 5  # a query is timed so often: other programs may use the machine
 
 
 @dataclass(frozen=True)
@@ -151,16 +153,6 @@ def simulated(case: Case, costs: Costs) -> Outcome:
     return outcome
 
 
-def shortest_s(work: Callable[[], object]) -> float:
-    """The shortest of five times, s: other programs may use the machine."""
-    times = []
-    for _ in range(5):
-        began = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - began)
-    return min(times)
-
-
 def measure() -> dict[str, Any]:
     """Statements of an image, bytes of its rows and times of queries, measured in PostgreSQL. Raises Missing."""
     from tests.conftest import write_image, write_psf
@@ -213,14 +205,14 @@ def measure() -> dict[str, Any]:
         with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
             connection.execute(text("VACUUM ANALYZE"))
         catalogue.owners.set_quota(DEFAULT_OWNER, 2**30)
-        metrics_s = shortest_s(catalogue.census.tally_files) / COPIES
-        quota_s = shortest_s(lambda: catalogue.owners.limited(DEFAULT_OWNER, 0)) / COPIES
+        metrics_s = seconds(catalogue.census.tally_files, ROUNDS) / COPIES
+        quota_s = seconds(lambda: catalogue.owners.limited(DEFAULT_OWNER, 0), ROUNDS) / COPIES
         catalogue.bulks.create(bulk_row("timed"), [])
         loop = (
             "FOR n IN 1..200 LOOP UPDATE bulks SET done = done + 1 WHERE phase = 'RUNNING'; COMMIT; END LOOP"
         )
         with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
-            finish_s = shortest_s(lambda: connection.execute(text(f"DO $$ BEGIN {loop}; END $$"))) / 200
+            finish_s = seconds(lambda: connection.execute(text(f"DO $$ BEGIN {loop}; END $$")), ROUNDS) / 200
         service.close()
     return {
         "statements": (spent["many"] - spent["few"]) / (MANY - FEW),

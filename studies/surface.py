@@ -27,10 +27,10 @@ import click
 from astropy.io import fits
 from click.testing import CliRunner
 
+from psfcore.files import sha256_of
 from psfcore.gap.report.report import gap_report
 from psfcore.psf import REACH_GRID_PX, crop_or_pad
 from psfcore.simulate.scatter_truth import total_kernel
-from psfcore.whole_files import sha256_of
 from service.cli.main import main as heliopsf
 from service.http.problems import STATUS_OF
 from service.openapi import description

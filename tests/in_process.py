@@ -9,21 +9,21 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
+from psfcore.files import sha256_of
 from psfcore.fits.header import FitsLimits, read_summary
 from psfcore.fits.psfs import stated_id
 from psfcore.fits.stored_psf import check_is_psf
 from psfcore.tables import lookup
 from psfcore.transit.archive import list_archive, pack
-from psfcore.whole_files import sha256_of
 from service.client.operations import Operations, Progress
 from service.client.outputs import written
 from service.views import JobView, ProductView, PsfView, ReportView
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, ProductRow, PsfRow, ReportRow
+from workers.contract.jobs import Phase
 from workers.contract.kinds import JobRequest
-from workers.contract.phases import Phase
 from workers.files.store import Store
-from workers.intake.deprecated import details_now
+from workers.intake.compatibility import details_now
 from workers.intake.requests import resolve
 from workers.intake.uploads import image_row, transit_row, uploaded_psf_row
 from workers.rows import row_of

@@ -1,5 +1,6 @@
-"""The memory and the cores that this process may use. A container may limit them to a part of the machine.
+"""The memory, the cores and the cache of built PSFs that this process may use. A container may limit memory and cores.
 
+Commands with ``--local`` and the Python functions share the cache of a user.
 This module needs no other module of ``workers``, so that the package ``heliopsf`` can import it alone.
 """
 
@@ -11,9 +12,20 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from platformdirs import user_cache_path
+
+from psfcore.errors import DataError
+from psfcore.psf_cache import PsfCache
+
 CGROUPS = Path("/sys/fs/cgroup")
 MEMBERSHIP = Path("/proc/self/cgroup")
 MEMINFO = Path("/proc/meminfo")
+FOLDER, LARGEST = "HELIOPSF_CACHE_DIR", "HELIOPSF_CACHE_MIB"
+DEFAULT_MIB = 2048  # about 15 PSFs of 2048 px with their components
+_PSFS, _PUBLISHED = (
+    "psfs",
+    "published",
+)  # a separate subfolder, because the cache makes its folder inaccessible to other users
 
 
 def cores() -> int:
@@ -96,3 +108,26 @@ def _text(file: Path) -> str:
         return file.read_text()
     except OSError:  # this system has no cgroups, or this cgroup has no such limit
         return ""
+
+
+def psf_cache() -> PsfCache:
+    """The cache in the folder that HELIOPSF_CACHE_DIR names, or in the user's cache folder, such as ``~/.cache/heliopsf``.
+
+    Raises DataError "bad-setting" if HELIOPSF_CACHE_MIB is not a whole number.
+    """
+    largest = os.environ.get(LARGEST) or str(DEFAULT_MIB)
+    if not (largest.isascii() and largest.isdigit()):
+        raise DataError(
+            "bad-setting", f"{LARGEST}: expected a whole number of MiB, 0 for no cache; got {largest!r}"
+        )
+    return PsfCache(_folder() / _PSFS, int(largest) * 2**20)
+
+
+def published_folder() -> Path:
+    """The folder of published PSFs (`psfcore.published_psfs`), beside the cache of built PSFs. Users may share it."""
+    return _folder() / _PUBLISHED
+
+
+def _folder() -> Path:
+    named = os.environ.get(FOLDER)
+    return Path(named).expanduser() if named else user_cache_path("heliopsf", appauthor=False)

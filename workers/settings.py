@@ -18,7 +18,7 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 from psfcore import software_version as software_version
 from psfcore.fits.blocks import FitsLimits
 from psfcore.transit.archive import ArchiveLimits
-from workers.contract.queues import Queue, queues_named
+from workers.contract.jobs import Queue, queues_named
 from workers.machine import cores, memory_bytes
 
 EMBEDDED_BROKER = "filesystem://"

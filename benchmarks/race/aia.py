@@ -281,9 +281,9 @@ def main() -> None:
     if not chosen.image.exists():
         print(f"expected a level 1 image of AIA; {chosen.image} does not exist: name one with AIA_IMAGE=FILE")
         return
+    from benchmarks.figures import write_part
     from psfcore.fits.blocks import FitsLimits
     from psfcore.fits.observation import read_observation
-    from studies.pages import write_part
 
     with TemporaryDirectory(prefix="heliopsf-aia-") as name:
         folder = Path(name)

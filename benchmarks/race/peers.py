@@ -374,7 +374,7 @@ def main() -> None:
     text = section(runs)
     print(f"\n{text}")
     if chosen.page:
-        from studies.pages import write_part
+        from benchmarks.figures import write_part
 
         write_part(chosen.page, "benchmarks.race.peers", text)
 

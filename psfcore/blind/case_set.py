@@ -32,12 +32,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.arrays import array_sha256
 from psfcore.blind.cases import DRAW, SetPlan, draw_case
 from psfcore.blind.make_case import make
 from psfcore.blind.simulator import simulate_case, simulator_of, source_sha256
-from psfcore.comparison import array_sha256
 from psfcore.errors import DataError
-from psfcore.whole_files import write_whole
+from psfcore.files import write_whole
 
 Plane = NDArray[np.float64]
 Progress = Callable[[str], None]

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from psfcore.blind.effects.effect import Earlier, Effect, Moment, apply_effects
 from psfcore.blind.effects.fine_optics import FINE, FineOptics
-from psfcore.simulate.disc import behind, binned, covered_share
 from psfcore.simulate.plan import HIGH, Plan
+from psfcore.simulate.sky import behind, binned, covered_share
 from psfcore.transit.transit import Place
 
 Plane = NDArray[np.float64]

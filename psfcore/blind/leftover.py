@@ -21,10 +21,9 @@ from numpy.typing import NDArray
 
 from psfcore.noise import Noise
 from psfcore.scatter.inversion import invert
-from psfcore.scatter.optics import Blur, Optics, pick
 from psfcore.scatter.reconstruction import DARK_MARGIN_PX, Reconstruction, TransitScenes
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW
-from psfcore.scatter.total_psf import TotalPsf
+from psfcore.scatter.total_psf import Blur, Optics, TotalPsf, pick
 from psfcore.simulate.scatter_truth import ScatterTruth
 from psfcore.transit.occulter import fully_dark
 from psfcore.transit.transit import Frame, Transit

@@ -24,7 +24,7 @@ from typing import Any
 
 from psfcore.blind.case_set import BlindSet
 from psfcore.errors import DataError
-from psfcore.whole_files import write_whole
+from psfcore.files import write_whole
 
 # For each schema, the keys that a complete result has.
 REPORT_SCHEMA, IDEAL_SCHEMA = "gap/2", "gap-ideal/1"

@@ -34,8 +34,8 @@ from psfcore.blind.cases import CLEAN, FOREIGN, MIXED, PAIR, SINGLE, SetPlan
 from psfcore.blind.effects.registry import KNOWN
 from psfcore.blind.make_case import WITH_EFFECTS, WITHOUT_EFFECTS
 from psfcore.errors import DataError
-from psfcore.extensions.user_code import is_file, module_in_file, named_errors, sha256_of_source
 from psfcore.transit.manifest import MANIFEST_NAME, read_manifest
+from psfcore.user_code import is_file, module_in_file, named_errors, sha256_of_source
 
 FUNCTION = "make_case"
 MOST_EFFECTS = 2

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.convolution.engine import Engine
-from psfcore.deconvolve.box import Box
 from psfcore.deconvolve.edges import Edges
+from psfcore.deconvolve.extent import Box
 from psfcore.errors import DataError
 from psfcore.fits.cards import Cards
 from psfcore.image import Image
@@ -58,7 +58,7 @@ class Conditions:
 
 @dataclass(frozen=True)
 class OfBox:
-    """How a box of an image was deconvolved alone (`psfcore.deconvolve.region`).
+    """How a box of an image was deconvolved alone (`psfcore.deconvolve.work`).
 
     box: the box in the pixels of the whole image. rim_px: largest width of the rim around it. error: bound of the
     difference from the deconvolution of the whole image, in the unit of the image; 0: there is no difference.

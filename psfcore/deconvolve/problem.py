@@ -55,7 +55,7 @@ class Method:
     edges: the default assumption about the scene beyond the edges. margin_share: largest share of its light that a pixel at
     the edge may get from beyond the margin; `margin_for` computes the default width of the margin from it. may_be_negative:
     whether results can be negative. keeps_flux: whether the steps conserve the flux of the plane, and so compensate for light
-    that leaves it (`psfcore.deconvolve.region`).
+    that leaves it (`psfcore.deconvolve.work`).
     """
 
     name: str

@@ -17,23 +17,21 @@ from astropy.io.fits import Header
 from numpy.typing import NDArray
 
 from psfcore import software_version
-from psfcore.deconvolve.assess.quality import MEANINGS
+from psfcore.deconvolve.assess.changes import MEANINGS
 from psfcore.deconvolve.assess.ranks import percentiles
-from psfcore.deconvolve.box import EXPECTED_RIM_PX
 from psfcore.deconvolve.conditions import Deconvolved, PreparedPsfs, Progress
 from psfcore.deconvolve.doubts import input_warnings
+from psfcore.deconvolve.extent import EXPECTED_RIM_PX, Demand, check_memory, product_bytes
 from psfcore.deconvolve.kernels import compiling_beside
-from psfcore.deconvolve.memory import Demand, check_memory, product_bytes
 from psfcore.deconvolve.problem import no_noise_model
-from psfcore.deconvolve.region import BoxWork, box_work
 from psfcore.deconvolve.summary import assumptions
-from psfcore.deconvolve.whole import Assessed, Options, Work
-from psfcore.drawing.units import unit_label
+from psfcore.deconvolve.work import Assessed, BoxWork, Options, Work, box_work
 from psfcore.fits.channel import check_channel
 from psfcore.fits.frame import frame_of
 from psfcore.fits.header import known_instrument, optional_text, seen_by
 from psfcore.fits.images import described, write_image
 from psfcore.fits.observation import check_exposure_of_sun
+from psfcore.fits.units import unit_label
 from psfcore.image import Image, MaskBit
 from psfcore.instruments.unknown import unknown_instrument
 from psfcore.psf import REACH_GRID_PX, Psf
@@ -319,7 +317,7 @@ def draw_preview(product: Product, psf: UsedPsf, path: Path) -> None:
 
 def draw_changes(product: Product, psf: UsedPsf, path: Path) -> None:
     """Draw difference, ratio and histograms into a PNG file."""
-    from psfcore.deconvolve.assess.plots import changes_png
+    from psfcore.deconvolve.assess.pictures import changes_png
 
     before, changes = product.image.pixels, product.assessed.changes
     changes_png(

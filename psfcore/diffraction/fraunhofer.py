@@ -53,6 +53,7 @@ from psfcore.compiled import compiled
 from psfcore.convolution.convolver import transform_axis
 from psfcore.diffraction.mirrored import MirroredTransforms, Place, can_transform, passes
 from psfcore.diffraction.pupil import MaskGrid, Pupil
+from psfcore.instruments.model import MM_PER_ANGSTROM, MM_PER_UM
 
 STRIP_ROWS = 16
 SURVEY_CELLS = 4096  # cells across the pupil when its area and symmetry are determined
@@ -60,8 +61,6 @@ FEWEST_SAMPLES = 14
 SPECTRA_BYTES = 700 * 2**20  # memory for the transforms along x that are kept at the same time
 _SYMMETRY_TOLERANCE_CELLS = 1e-2
 _SYMMETRY_SEED = 174
-_MM_PER_ANGSTROM = 1e-7
-_MM_PER_UM = 1e-3
 
 NO_SYMMETRY, MIRROR, MIRROR_AND_TRANSPOSE = "none", "mirror", "mirror and transpose"
 
@@ -86,7 +85,7 @@ def samples_per_pixel(
     width_mm: float, *, wavelength_angstrom: float, focal_length_mm: float, pixel_pitch_um: float
 ) -> int:
     """The smallest even S that satisfies Eq. (3)."""
-    resolved_mm = wavelength_angstrom * _MM_PER_ANGSTROM * focal_length_mm / (pixel_pitch_um * _MM_PER_UM)
+    resolved_mm = wavelength_angstrom * MM_PER_ANGSTROM * focal_length_mm / (pixel_pitch_um * MM_PER_UM)
     return max(FEWEST_SAMPLES, 2 * math.ceil(width_mm / resolved_mm - 1e-9))
 
 
@@ -113,7 +112,7 @@ def far_field(
         "pixel_pitch_um": pixel_pitch_um,
     }
     samples = samples_per_pixel(pupil.width_mm, **optics)
-    cell_mm = wavelength_angstrom * _MM_PER_ANGSTROM * focal_length_mm / (n * pixel_pitch_um * _MM_PER_UM)
+    cell_mm = wavelength_angstrom * MM_PER_ANGSTROM * focal_length_mm / (n * pixel_pitch_um * MM_PER_UM)
     mask = MaskGrid(pupil, cell_mm)
     with ThreadPoolExecutor(max_workers=threads) as pool:
         survey = _survey(MaskGrid(pupil, pupil.width_mm / SURVEY_CELLS), pool)

@@ -43,11 +43,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from psfcore.convolution.convolver import ChirpTransform
 from psfcore.errors import DataError
-from psfcore.instruments.model import Mesh, Mirror
+from psfcore.instruments.model import MM_PER_UM, Mesh, Mirror
 
 SAMPLING_MARGIN = 1.5
 MOST_SAMPLES = 8_000_000
-MM_PER_UM = 1e-3
 
 Wave = NDArray[np.complex128]
 Vector = NDArray[np.float64]

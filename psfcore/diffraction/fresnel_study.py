@@ -34,7 +34,6 @@ from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import linear_convolve
 from psfcore.diffraction.fresnel import (
-    MM_PER_UM,
     SAMPLING_MARGIN,
     FresnelStep,
     Grid,
@@ -58,12 +57,11 @@ from psfcore.diffraction.light_path import (
 )
 from psfcore.diffraction.mesh_series import mesh_line, order_spacing_px
 from psfcore.errors import DataError
-from psfcore.instruments.model import Instrument
+from psfcore.instruments.model import MM_PER_UM, UM_PER_MM, Instrument
 
 DISTANCES_MM = (50.0, 100.0, 200.0, 273.0, 400.0, 500.0, 550.0)
 ZOOM_PX = 64
 _SIZE_PX = 2 * REACH_PX + 1
-_UM_PER_MM = 1e3
 _ANGSTROM_PER_MM = 1e7
 Progress = Callable[[int, int], None]
 
@@ -246,7 +244,7 @@ class _AtWheel:
             for (this, _), (after, _), length_mm in zip(planes, planes[1:], lengths_mm, strict=False)
         ]
         return tuple(
-            Sampling(grid.plane, grid.width_mm, grid.step_mm * _UM_PER_MM, grid.samples, count, light)
+            Sampling(grid.plane, grid.width_mm, grid.step_mm * UM_PER_MM, grid.samples, count, light)
             for (grid, light), count in zip(planes, [*least, None], strict=True)
         )
 
@@ -265,7 +263,7 @@ def _wheel_spacing_px(path: LightPath, distance_mm: float) -> float:
         wavelength_angstrom=path.wavelength_mm * _ANGSTROM_PER_MM,
         distance_mm=distance_mm,
         pitch_um=path.wheel_mesh.pitch_um,
-        pixel_pitch_um=path.pixel_mm * _UM_PER_MM,
+        pixel_pitch_um=path.pixel_mm * UM_PER_MM,
     )
 
 

@@ -34,7 +34,6 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from psfcore.diffraction.fresnel import (
-    MM_PER_UM,
     FresnelStep,
     Grid,
     Vector,
@@ -47,14 +46,13 @@ from psfcore.diffraction.fresnel import (
     open_share,
 )
 from psfcore.errors import DataError
-from psfcore.instruments.model import Aperture, Instrument, Mesh, Mirror
+from psfcore.instruments.model import MM_PER_ANGSTROM, MM_PER_UM, Aperture, Instrument, Mesh, Mirror
 
 REACH_PX = 1023
 SAMPLES_PER_PIXEL = 16
 SEARCH_MM = 0.05
 TOLERANCE_MM = 1e-5
 HIGHEST_ORDER = 15
-_MM_PER_ANGSTROM = 1e-7
 _PLACES = ("entrance", "filter_wheel")
 
 
@@ -205,7 +203,7 @@ def light_path(instrument: Instrument) -> LightPath:
         got = f"{entrance.angle_deg:g} and {wheel.angle_deg:g} degrees"
         raise _lacking(instrument, "meshes.angle_deg", expected, got)
     return LightPath(
-        wavelength_mm=instrument.wavelength_angstrom * _MM_PER_ANGSTROM,
+        wavelength_mm=instrument.wavelength_angstrom * MM_PER_ANGSTROM,
         aperture=instrument.aperture,
         entrance_mesh=entrance,
         primary=instrument.mirrors[0],

@@ -59,10 +59,9 @@ from numpy.typing import NDArray
 from scipy.special import sici
 
 from psfcore.compiled import compiled
+from psfcore.instruments.model import UM_PER_ANGSTROM, UM_PER_MM
 from psfcore.instruments.workload import FINEST_CELL_PX
 
-_UM_PER_ANGSTROM = 1e-4
-_UM_PER_MM = 1e3
 _LARGEST_CELL_PX = 0.4
 # The density of cells is proportional to the square root of light times width. About _CELLS_AN_ORDER cells are
 # distributed over each order, and about _CELLS_IN_ALL further cells over the whole axis. An order that contains less
@@ -77,7 +76,7 @@ def order_spacing_px(
     *, wavelength_angstrom: float, distance_mm: float, pitch_um: float, pixel_pitch_um: float
 ) -> float:
     """Spacing of the diffraction orders, lambda z / d, px."""
-    reach_um2 = wavelength_angstrom * _UM_PER_ANGSTROM * distance_mm * _UM_PER_MM
+    reach_um2 = wavelength_angstrom * UM_PER_ANGSTROM * distance_mm * UM_PER_MM
     return reach_um2 / pitch_um / pixel_pitch_um
 
 

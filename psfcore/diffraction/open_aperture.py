@@ -49,11 +49,9 @@ from scipy.integrate import cumulative_simpson
 from scipy.special import j0, j1
 
 from psfcore.compiled import compiled
-from psfcore.instruments.model import Aperture, signed_area
+from psfcore.instruments.model import MM_PER_ANGSTROM, MM_PER_UM, UM_PER_MM, Aperture, signed_area
 from psfcore.instruments.workload import AIRY_STEP
 
-_MM_PER_ANGSTROM, _MM_PER_UM = 1e-7, 1e-3
-_UM_PER_MM = 1e3
 NEAR_PX = 24
 # Number of points of the integral along an edge: within NEAR_PX of an axis, and farther out.
 NEAR_POINTS, FAR_POINTS = 48, 16
@@ -89,7 +87,7 @@ def airy_kernel(
     The kernel is not normalised: its sum is below 1, because light falls outside the array.
     """
     resolved_px = (
-        wavelength_angstrom * _MM_PER_ANGSTROM * focal_length_mm / diameter_mm * _UM_PER_MM / pixel_pitch_um
+        wavelength_angstrom * MM_PER_ANGSTROM * focal_length_mm / diameter_mm * UM_PER_MM / pixel_pitch_um
     )
     half = size // 2
     v_per_px = math.pi / resolved_px
@@ -140,8 +138,8 @@ def edge_kernel(
     samples a pixel (disc, ring, quadrant, hexagon), the light outside the central pixel is right to 2 %.
     """
     angles, lengths_mm, area_mm2 = _edges(aperture)
-    reach_mm = wavelength_angstrom * _MM_PER_ANGSTROM * focal_length_mm
-    k = reach_mm / (4 * math.pi**2 * pixel_pitch_um * _MM_PER_UM * area_mm2)
+    reach_mm = wavelength_angstrom * MM_PER_ANGSTROM * focal_length_mm
+    k = reach_mm / (4 * math.pi**2 * pixel_pitch_um * MM_PER_UM * area_mm2)
     kernel = np.zeros((size, size))
     kernel[size // 2, size // 2] = 1.0
     _cast(kernel, np.cos(angles), np.sin(angles), k * lengths_mm)

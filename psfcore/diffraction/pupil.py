@@ -32,10 +32,9 @@ from numpy.typing import NDArray
 
 from psfcore.compiled import compiled
 from psfcore.errors import DataError
-from psfcore.instruments.model import Aperture, MaskImage, Mesh, Mount, Sector, signed_area
+from psfcore.instruments.model import UM_PER_MM, Aperture, MaskImage, Mesh, Mount, Sector, signed_area
 
 CIRCLE_CORNERS = 4096
-_UM_PER_MM = 1e3
 # A ring that crosses the rim is a mistake in the instrument file. This small excess is allowed, because numbers are
 # rounded.
 _RIM_TOLERANCE_MM = 1e-6
@@ -228,8 +227,8 @@ class MaskGrid:
 
     def _mesh_line(self, mesh: Mesh) -> NDArray[np.float64]:
         """The open share of each cell along an axis of the mesh, shape (cells,)."""
-        edges_um = (np.arange(self.cells + 1, dtype=np.float64) - self.cells / 2) * self.cell_mm * _UM_PER_MM
-        return np.diff(_open_length_um(edges_um, mesh)) / (self.cell_mm * _UM_PER_MM)
+        edges_um = (np.arange(self.cells + 1, dtype=np.float64) - self.cells / 2) * self.cell_mm * UM_PER_MM
+        return np.diff(_open_length_um(edges_um, mesh)) / (self.cell_mm * UM_PER_MM)
 
 
 def _open_length_um(x_um: NDArray[np.floating], mesh: Mesh) -> NDArray[np.float64]:

@@ -1,14 +1,15 @@
-"""Plots: an image before and after deconvolution, and a PSF.
+"""Plots of an image before and after deconvolution and of a PSF, and the parts that the charts of fits and evaluations share.
 
 Each plot has its own figure on the Agg canvas, so threads share no state. pyplot would keep a state that they share.
 """
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterator, Sequence
 from io import BytesIO
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -22,7 +23,7 @@ from matplotlib.ticker import FixedFormatter, FuncFormatter
 from numpy.typing import NDArray
 
 from psfcore.drawing.thumbnail import EUV_POINTS, NO_DATA, block_means
-from psfcore.psf import Psf, crop_centred, cumulative_curve, radial_profile
+from psfcore.psf import REACH_GRID_PX, Psf, crop_centred, cumulative_curve, radial_profile
 
 PANEL_PX = 640
 CHANGE_LIMIT_PCT = 100.0
@@ -45,6 +46,23 @@ _OTHER_CURVE = ("#2b8a6e", 1.3, "-")
 INK = "#222222"
 
 Plane = NDArray[np.floating]
+Vector = NDArray[np.float64]
+Place = tuple[float, float, float, float]  # left, bottom, width and height, as fractions of the figure
+
+NEAREST_PX, FARTHEST_PX = 0.5, REACH_GRID_PX / 2
+POINTINGS = ("#1b4f8a", "#c2402f", "#2b8a6e", "#7b3fa0", "#8a6d00", "#5b5b5b")
+_MANY_IMAGES = 60  # with this many images or more, markers are smaller
+_LETTERS_AN_INCH = 11.5
+
+
+class Panel(NamedTuple):
+    """An image to draw. beyond: the ends of the colour bar, beyond which there are values: "max" or "both"."""
+
+    title: str
+    pixels: Plane
+    colours: Colormap
+    norm: Normalize
+    beyond: str
 
 
 def write_png(figure: Figure, target: str | Path | IO[bytes], **options: Any) -> None:
@@ -101,33 +119,50 @@ def preview_png(before: Plane, after: Plane, path: str | Path, *, title: str, un
 def preview_figure(before: Plane, after: Plane, *, title: str, unit: str) -> Figure:
     """Draw three panels [y, x], first row at the bottom: before, after (same stretch), change in percent.
 
-    unit: unit of the pixels, see `psfcore.drawing.units`.
+    unit: unit of the pixels, see `psfcore.fits.units`.
     """
-    step = max(1, -(-max(before.shape) // PANEL_PX))
-    small_before, small_after = binned(before, step), binned(after, step)
-    stretch = square_root_stretch(small_before, small_after)
-    change = change_pct(small_before, small_after)
     figure = Figure(figsize=(15.6, 5.55), dpi=100, facecolor="white")
     figure.text(0.045, 0.955, title, fontsize=13, color=INK, va="center", weight="bold")
-    extent = (-0.5, before.shape[1] - 0.5, -0.5, before.shape[0] - 0.5)
-    panels: list[tuple[str, Plane, Colormap, Normalize, str]] = [
-        ("Before", small_before, GOLD, stretch, unit),
-        ("After", small_after, GOLD, stretch, unit),
-        ("Change", change, CHANGE, Normalize(-CHANGE_LIMIT_PCT, CHANGE_LIMIT_PCT), "% of before"),
+    places = [(0.045 + 0.318 * index, 0.085, 0.266, 0.79) for index in range(3)]
+    draw_panels(figure, compared_panels(before, after, unit), places, before.shape)
+    return figure
+
+
+def compared_panels(before: Plane, after: Plane, unit: str) -> list[Panel]:
+    """The panels of an image before and after (same stretch), and of the change in percent; each at most PANEL_PX wide."""
+    step = max(1, -(-max(before.shape) // PANEL_PX))
+    before, after = binned(before, step), binned(after, step)
+    stretch = square_root_stretch(before, after)
+    limits_pct = Normalize(-CHANGE_LIMIT_PCT, CHANGE_LIMIT_PCT)
+    return [
+        Panel(f"Before ({unit})", before, GOLD, stretch, "max"),
+        Panel(f"After ({unit})", after, GOLD, stretch, "max"),
+        Panel("Change (% of before)", change_pct(before, after), CHANGE, limits_pct, "both"),
     ]
-    for index, (name, data, colours, norm, label) in enumerate(panels):
-        axes = figure.add_axes((0.045 + 0.318 * index, 0.085, 0.266, 0.79))
+
+
+def draw_panels(
+    figure: Figure, panels: Sequence[Panel], places: Sequence[Place], shape: tuple[int, ...]
+) -> None:
+    """Draw panels, three in a row, each with a colour bar. shape: of the image in pixels, for the axes."""
+    extent = (-0.5, shape[1] - 0.5, -0.5, shape[0] - 0.5)
+    for index, (panel, place) in enumerate(zip(panels, places, strict=True)):
+        axes = figure.add_axes(place)
         drawn = axes.imshow(
-            data, origin="lower", cmap=colours, norm=norm, extent=extent, interpolation="nearest"
+            panel.pixels,
+            origin="lower",
+            cmap=panel.colours,
+            norm=panel.norm,
+            extent=extent,
+            interpolation="nearest",
         )
-        axes.set_title(f"{name} ({label})", fontsize=11, color=INK, loc="left")
+        axes.set_title(panel.title, fontsize=11, color=INK, loc="left")
         axes.set_xlabel("x (px)")
-        if index == 0:
+        if index % 3 == 0:
             axes.set_ylabel("y (px)")
         else:
             axes.set_yticks([])
-        colourbar(figure, axes, drawn, beyond="both" if name == "Change" else "max")
-    return figure
+        colourbar(figure, axes, drawn, beyond=panel.beyond)
 
 
 def psf_png(psf: Psf, path: str | Path) -> None:
@@ -238,3 +273,102 @@ def colourbar(figure: Figure, axes: Any, drawn: Any, *, beyond: str) -> None:
     bar.outline.set_linewidth(0.5)
     bar_axes.tick_params(labelsize=8.5)
     axes.tick_params(labelsize=8.5)
+
+
+def headed_figure(width_in: float, height_in: float, name: str, sentence: str) -> Figure:
+    """An empty figure with a name in bold and a sentence below it."""
+    layout = ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1, hspace=0.03, wspace=0.03)
+    figure = Figure(figsize=(width_in, height_in), dpi=100, facecolor="white", layout=layout)
+    # The layout reserves space for one title. Its first line is empty, and the name fills that line in bold.
+    words = "\n".join(textwrap.wrap(sentence, int(_LETTERS_AN_INCH * width_in)))
+    figure.suptitle(f"\n{words}", fontsize=11, color=INK, x=0.012, ha="left", linespacing=1.5)
+    figure.text(0.012, 1 - 0.12 / height_in, name, fontsize=14, color=INK, weight="bold", va="top")
+    return figure
+
+
+def legend(axes: Any, size: float = 9, loc: str = "upper right", **options: Any) -> None:
+    """Draw a legend without a frame."""
+    axes.legend(fontsize=size, loc=loc, frameon=False, **options)
+
+
+def boxed_legend(axes: Any, size: float = 9, loc: str = "best") -> None:
+    """Draw a legend of two columns on a white ground, for charts that are full of lines."""
+    axes.legend(fontsize=size, loc=loc, frameon=True, framealpha=0.85, edgecolor="none", ncols=2)
+
+
+def marker_size(images: int) -> float:
+    """The size of the markers of a chart with one point for each image."""
+    return 5.0 if images < _MANY_IMAGES else 3.2
+
+
+def by_pointing(pointings: Sequence[int]) -> list[tuple[int, NDArray[np.bool_], str]]:
+    """Each pointing with a mask of its images and its colour. pointings: the pointing of each image."""
+    of_images = np.array(pointings)
+    return [
+        (one, of_images == one, POINTINGS[n % len(POINTINGS)]) for n, one in enumerate(sorted(set(pointings)))
+    ]
+
+
+def draw_errors(
+    axes: Any, pointings: Sequence[int], where: Vector, values: Vector, noise: Vector | None
+) -> None:
+    """Draw the errors of images, with their noise if it is known. Values of nan are not drawn.
+
+    The colour shows the pointing. pointings, where: pointing and abscissa of each image.
+    """
+    axes.axhline(0, color="#555555", linewidth=1.0)
+    for pointing, here, colour in by_pointing(pointings):
+        bars = None if noise is None else noise[here]
+        style = points(colour, marker_size(len(pointings)))
+        axes.errorbar(where[here], values[here], bars, label=f"{pointing}", **style)
+    span = np.abs(values) + (0.0 if noise is None else noise)
+    top = 1.12 * float(span[np.isfinite(span)].max(initial=1e-3))
+    axes.set_ylim(-top, 1.35 * top)
+    short = {"columnspacing": 1.0, "handletextpad": 0.2}
+    legend(axes, loc="upper center", title="pointing", title_fontsize=9, ncols=6, **short)
+
+
+def draw_band(
+    axes: Any, x: Vector, limits: NDArray[np.float64], colour: str, name: str, *, marker: str = ""
+) -> None:
+    """Draw a median and its bands of 1 and 2 sigma. limits: the rows -2 sigma, -1 sigma, median, +1 sigma, +2 sigma."""
+    low_2, low_1, median, high_1, high_2 = limits
+    axes.fill_between(x, low_2, high_2, color=colour, alpha=0.18, linewidth=0)
+    axes.fill_between(x, low_1, high_1, color=colour, alpha=0.32, linewidth=0)
+    axes.plot(x, median, color=colour, marker=marker, markersize=3, linewidth=1.4, label=name)
+
+
+def draw_weights_of_shells(
+    axes: Any, edges_px: Vector, limits: NDArray[np.float64], field_px: float, colour: str
+) -> None:
+    """Draw the weights of the free shells that begin within the field as steps: medians, bands of 1 and 2 sigma.
+
+    No pixel constrains the other shells. limits: as for `draw_band`, one column for each shell. The axis is logarithmic,
+    so weights of 0 are drawn as very small ones.
+    """
+    shown = edges_px[:-1] < field_px
+    edges = edges_px[: np.count_nonzero(shown) + 1]
+    low_2, low_1, median, high_1, high_2 = np.maximum(limits[:, shown], 1e-30)
+    for low, high, alpha, name in ((low_2, high_2, 0.14, "±2 σ"), (low_1, high_1, 0.28, "±1 σ")):
+        steps = np.append(low, low[-1]), np.append(high, high[-1])
+        style: dict[str, Any] = {"color": colour, "alpha": alpha, "linewidth": 0}
+        axes.fill_between(edges, *steps, step="post", label=f"free shells, {name}", **style)
+    axes.stairs(median, edges, baseline=None, color=colour, linewidth=1.1, label="free shells, median")
+
+
+def draw_totals(axes: Any, totals: Vector, colour: str) -> None:
+    """Draw a histogram of the total scatter of all fits. totals: fractions of all light."""
+    axes.hist(100 * totals, bins=min(25, max(5, totals.size // 4)), color=colour, label="folds")
+    axes.set(xlabel="Diffusely scattered light (% of all light)", ylabel="Number of fits")
+
+
+def along_distance(axes: Any, field_px: float, label: str = "Distance (px)") -> None:
+    """Make the x axis a logarithmic axis of distances, with ticks such as 1, 10, 100.
+
+    Distances beyond the field are shaded, because the PSF there is an extrapolation of the fitted shape.
+    """
+    axes.set(xscale="log", xlim=(NEAREST_PX, FARTHEST_PX), xlabel=label)
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    if field_px < FARTHEST_PX:
+        shade: dict[str, Any] = {"color": "#efefef", "zorder": 0, "linewidth": 0}
+        axes.axvspan(field_px, FARTHEST_PX, label="beyond the field", **shade)

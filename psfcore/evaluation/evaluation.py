@@ -45,9 +45,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError
-from psfcore.scatter.optics import Optics, Pixels, noise_covariance, pick, put
 from psfcore.scatter.reconstruction import LEAST_DARK_PIXELS, Progress, dark_pixels
 from psfcore.scatter.shapes import Vector
+from psfcore.scatter.total_psf import Optics, Pixels, noise_covariance, pick, put
 from psfcore.transit.occulter import DOUBT_SIGMAS, FoundPlace, find_occulter
 from psfcore.transit.transit import Frame, Kernel, Transit
 

@@ -8,12 +8,21 @@ from typing import Any
 
 import numpy as np
 
-from psfcore.drawing.charts import boxed_legend, draw_errors, headed_figure, legend, marker_size
-from psfcore.drawing.plots import CHANGE, points, tidy, write_png
+from psfcore.drawing.plots import (
+    CHANGE,
+    boxed_legend,
+    draw_errors,
+    headed_figure,
+    legend,
+    marker_size,
+    points,
+    tidy,
+    write_png,
+)
 from psfcore.evaluation.evaluation import Evaluation, FrameEvaluation, Superposed
 from psfcore.evaluation.report import sentence
 from psfcore.scatter.shapes import Vector
-from psfcore.scatter.validation.dark_offsets import DarkOffsetStudy
+from psfcore.scatter.validation.robustness import DarkOffsetStudy
 
 _OBSERVED, _SIMULATED = "#444444", "#c2402f"
 _OFFSETS = ("#12407a", "#5b9bd5", "#e39a5c", "#a3301b", "#6f4a9e", "#5b5b5b")

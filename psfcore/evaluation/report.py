@@ -25,9 +25,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.arrays import json_attributes, json_values
 from psfcore.evaluation.evaluation import Evaluation, FrameEvaluation, Slice, Superposed
-from psfcore.json_values import json_attributes, json_values
-from psfcore.scatter.validation.dark_offsets import DarkOffsetStudy
+from psfcore.scatter.validation.robustness import DarkOffsetStudy
 
 Vector = NDArray[np.float64]
 

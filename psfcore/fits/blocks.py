@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
 from psfcore.errors import HeaderError
+from psfcore.files import GzipStream
 from psfcore.fits.cards import (
     LARGEST_COUNT,
     bad_card,
@@ -33,7 +34,6 @@ from psfcore.fits.cards import (
     optional_text,
 )
 from psfcore.fits.compression import check_compression, check_counts
-from psfcore.gunzip import GzipStream
 
 if TYPE_CHECKING:
     from astropy.io.fits import Header

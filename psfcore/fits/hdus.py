@@ -25,12 +25,12 @@ from astropy.io.fits.verify import VerifyError
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError, HeaderError
+from psfcore.files import probe
 from psfcore.fits.blocks import FitsLimits, Hdu, Source, first_image, open_source, skip_data, walk
 from psfcore.fits.cards import optional_number
 from psfcore.fits.compression import may_hold_unwritten_memory
 from psfcore.fits.header import HeaderSummary, is_plane, shape_of, summary_of
 from psfcore.limited import fill_new_memory, run_limited
-from psfcore.whole_files import probe
 
 _CHECKSUM_COMMENT = "computed when the file was written"
 # The cards of a tile-compressed image that describe the table of its tiles. FITS standard 4.0, sections 7.3 and 10.1.

@@ -43,7 +43,9 @@ def write_psf(path: str | Path, psf: Psf, *, instrument_file: bytes | None = Non
     if psf.fitted is not None:
         hdus.append(_fitted_hdu(psf.fitted))
     if instrument_file is not None:
-        hdus.append(_instrument_hdu(instrument_file))
+        values = np.frombuffer(instrument_file, dtype=np.uint8)[None]
+        column = fits.Column(name="TOML", format=f"{values.size}B", array=values)
+        hdus.append(fits.BinTableHDU.from_columns([column], name="INSTRUMENT"))
     write_hdus(path, hdus)
 
 
@@ -132,12 +134,6 @@ def _read_fitted(hdu: fits.BinTableHDU) -> FittedShape:
     )
 
 
-def _instrument_hdu(text: bytes) -> fits.BinTableHDU:
-    values = np.frombuffer(text, dtype=np.uint8)[None]
-    column = fits.Column(name="TOML", format=f"{values.size}B", array=values)
-    return fits.BinTableHDU.from_columns([column], name="INSTRUMENT")
-
-
 def read_psf(path: str | Path, limits: FitsLimits, *, parts: bool = True) -> Psf:
     """Read a PSF from the first 2-D image of a file, and its metadata from the header.
 
@@ -213,7 +209,7 @@ def _read_extras(
             for hdu in hdus[1:]:
                 if isinstance(hdu, fits.ImageHDU) and hdu.shape == shape:
                     components[hdu.name] = np.array(hdu.data, dtype=np.float64)
-                elif not _is_plain_table(hdu):
+                elif not isinstance(hdu, fits.BinTableHDU) or _has_heap(hdu):
                     continue
                 elif hdu.name == "INSTRUMENT":
                     text = np.asarray(hdu.data["TOML"][0], dtype=np.uint8).tobytes()
@@ -227,8 +223,6 @@ def _read_extras(
     return components, provenance, fitted
 
 
-def _is_plain_table(hdu: Any) -> bool:
-    """Whether an HDU is a table whose columns fill its rows exactly, as in the files of write_psf."""
-    if not isinstance(hdu, fits.BinTableHDU):
-        return False
-    return not any(column.in_heap for column in read_columns(hdu.header))
+def _has_heap(table: fits.BinTableHDU) -> bool:
+    """Whether data of a table lie outside its rows, as never in the files of write_psf."""
+    return any(column.in_heap for column in read_columns(table.header))

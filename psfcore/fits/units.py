@@ -3,6 +3,7 @@
 Counts are DN, ADU or counts; all three mean numbers of the A/D converter. A rate is counts per time. Both may be written
 per pixel, in every way that `astropy.units` reads, and in the ways of observatories that it does not read ("dn/sec",
 "counts / pixel"). Saturation levels and noise figures are in DN of one exposure, so `dn_per_unit` converts them.
+`unit_label` and `rate_label` are the units that pictures show.
 """
 
 from __future__ import annotations
@@ -26,6 +27,10 @@ _WORDS = {
 }
 # Marks of units that are not proportional to the light. Pixels in such units cannot be deconvolved.
 _NOT_LINEAR = ("log", "sqrt", "mag", "dex", "db", "**0.5", "^0.5", "**(1/2)")
+_UNKNOWN = "unit unknown"
+_LONGEST = 30
+# Units of counts. The number of counts depends on the exposure time.
+_COUNTS = re.compile(r"(dn|adu|ct|counts?|electrons?|photons?|ph)(/?pix(el)?)?", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -133,3 +138,28 @@ def _unit_of_xrt(header: Cards) -> str | None:
     except KeyError:
         history = ""
     return "DN/s" if "XRT_RENORMALIZE" in history.upper() else "DN"
+
+
+def unit_label(image: Image) -> str:
+    """The unit of the pixels, such as "DN/s" or "DN in 2 s"; for counts with the exposure time.
+
+    The unit is the card BUNIT, or else the card PIXLUNIT, which AIA uses. Without these cards it is "unit unknown".
+    """
+    unit = _unit(image)
+    if not _COUNTS.fullmatch(unit):
+        return unit
+    return f"{unit}, exposure unknown" if image.exposure_s is None else f"{unit} in {image.exposure_s:.4g} s"
+
+
+def rate_label(image: Image) -> str:
+    """The unit after counts were divided by the exposure time, such as "DN/s"."""
+    unit = _unit(image)
+    if unit == _UNKNOWN:
+        return f"{_UNKNOWN}, per s"
+    return f"{unit}/s" if _COUNTS.fullmatch(unit) else unit
+
+
+def _unit(image: Image) -> str:
+    """The unit without spaces at its ends; the letter $ would start a formula in a label, so it is removed."""
+    found = image.unit or optional_text(image.header, "PIXLUNIT") or ""
+    return found.replace("$", "").strip()[:_LONGEST] or _UNKNOWN

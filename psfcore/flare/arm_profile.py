@@ -39,8 +39,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.optimize import nnls
 
+from psfcore.arrays import json_attributes
 from psfcore.errors import DataError
-from psfcore.json_values import json_attributes
 from psfcore.psf import Psf
 from psfcore.scatter.total_psf import DIFFRACTION, SCATTER
 

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.drawing.units import rate_label, unit_label
 from psfcore.errors import DataError
-from psfcore.fits.units import parse_unit
+from psfcore.fits.units import parse_unit, rate_label, unit_label
 from psfcore.flare.arm_profile import BOX_PX, FlareComparison, compare_on_flare, flare_centre
 from psfcore.flare.arms import measure_arms
 from psfcore.image import Image

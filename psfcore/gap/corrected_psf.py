@@ -25,8 +25,7 @@ from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.verdict.correction import Corrected
 from psfcore.gap.view import Field, View
 from psfcore.psf import REACH_GRID_PX, FittedShape, Psf, crop_or_pad
-from psfcore.scatter.optics import Blur, Lanes, Optics
-from psfcore.scatter.total_psf import TotalPsf
+from psfcore.scatter.total_psf import Blur, Lanes, Optics, TotalPsf
 from psfcore.transit.transit import Place
 
 Kernel = NDArray[np.float64]

@@ -6,8 +6,8 @@ import hashlib
 from functools import cache
 from pathlib import Path
 
+from psfcore import user_code
 from psfcore.errors import DataError
-from psfcore.extensions import user_code
 
 _LIBRARY = Path(__file__).parent / "library"
 _CALIBRATION = Path(__file__).parent / "verdict" / "calibration.json"
@@ -21,7 +21,7 @@ def library_sha256() -> str:
 
 
 def sha256_of_source(source: str) -> str:
-    """SHA-256 (hex) of the source text of added effects (`psfcore.extensions.user_code`). Raises DataError "bad-effects"."""
+    """SHA-256 (hex) of the source text of added effects (`psfcore.user_code`). Raises DataError "bad-effects"."""
     return user_code.sha256_of_source(source, bad_effects)
 
 

@@ -51,6 +51,7 @@ from numpy.typing import NDArray
 
 from psfcore.build import known_diffraction
 from psfcore.errors import DataError
+from psfcore.files import write_whole
 from psfcore.fits.blocks import LIMITS
 from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.cells import cells_of
@@ -64,7 +65,6 @@ from psfcore.scatter.inversion import invert
 from psfcore.scatter.reconstruction import Progress, Solution, dark_pixels
 from psfcore.transit.folder import read_transit
 from psfcore.transit.transit import Transit
-from psfcore.whole_files import write_whole
 
 Vector = NDArray[np.float64]
 

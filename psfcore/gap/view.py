@@ -16,8 +16,8 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.scatter.optics import Blur, Lanes, put
 from psfcore.scatter.reconstruction import Solution
+from psfcore.scatter.total_psf import Blur, Lanes, put
 from psfcore.transit.occulter import coverage, disc_distance, neighbours_of, patch_window
 
 Field = NDArray[np.float32]

@@ -24,6 +24,7 @@ from typing_extensions import TypedDict
 from psfcore.errors import MOST_TOLD, DataError
 from psfcore.instruments.files import instrument_path
 
+MM_PER_ANGSTROM, MM_PER_UM, UM_PER_ANGSTROM, UM_PER_MM = 1e-7, 1e-3, 1e-4, 1e3
 _MOST_DOTS = 64  # a part of the file without brackets, commas or line ends may contain this number of dots
 
 

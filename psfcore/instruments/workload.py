@@ -16,7 +16,7 @@ import math
 from dataclasses import dataclass
 
 from psfcore.errors import DataError
-from psfcore.instruments.model import Instrument, Mesh
+from psfcore.instruments.model import MM_PER_ANGSTROM, MM_PER_UM, Instrument, Mesh
 
 LARGEST_SIZE_PX = 4096
 PERIOD_PX = 4096  # size of the transform: light wraps around at 4096 px, not at the 2048 px that are kept
@@ -27,7 +27,6 @@ AIRY_STEP = 0.02  # step in v of the table of the analytic pattern
 MOST_SAMPLES = 256
 MOST_CELLS = 2_000_000
 MOST_ORDERS = 10_000  # of a hexagonal mesh, from the centre to the corner of the largest array
-_MM_PER_ANGSTROM, _MM_PER_UM = 1e-7, 1e-3
 
 
 @dataclass(frozen=True)
@@ -51,8 +50,8 @@ class Workload:
 
 def workload(instrument: Instrument, size: int) -> Workload:
     """The sizes for a PSF of `size` px."""
-    shortest_mm = min(line.wavelength_angstrom for line in instrument.spectral_lines) * _MM_PER_ANGSTROM
-    pixel_mm = instrument.detector.pixel_pitch_um * _MM_PER_UM
+    shortest_mm = min(line.wavelength_angstrom for line in instrument.spectral_lines) * MM_PER_ANGSTROM
+    pixel_mm = instrument.detector.pixel_pitch_um * MM_PER_UM
     samples = 2 * instrument.aperture.diameter_mm * pixel_mm / (shortest_mm * instrument.focal_length_mm)
     corner_px = (size // 2 + 1.5) * math.sqrt(2)
     # The error of a missing table of distances is raised when the PSF is built.
@@ -123,4 +122,4 @@ def _cells(instrument: Instrument, mesh: Mesh, wavelength_mm: float, corner_px: 
 def _spacing_px(instrument: Instrument, mesh: Mesh, wavelength_mm: float) -> float:
     """lambda z / d, the spacing of the orders of a square mesh, px."""
     reach_mm2 = wavelength_mm * instrument.mesh_distance_mm(mesh)
-    return reach_mm2 / (mesh.pitch_um * _MM_PER_UM) / (instrument.detector.pixel_pitch_um * _MM_PER_UM)
+    return reach_mm2 / (mesh.pitch_um * MM_PER_UM) / (instrument.detector.pixel_pitch_um * MM_PER_UM)

@@ -29,7 +29,7 @@ from psfcore.scatter.inversion import CONVERGED_POINTS
 from psfcore.scatter.reconstruction import DARK_MARGIN_PX, DARK_MARGIN_SIGMAS, LEAST_DARK_PIXELS
 from psfcore.scatter.total_psf import SCATTER
 from psfcore.scatter.validation.cross_validation import RUNS
-from psfcore.scatter.validation.dark_offsets import DarkOffsetStudy
+from psfcore.scatter.validation.robustness import DarkOffsetStudy
 from psfcore.tables.make import TOTAL
 from psfcore.transit.transit import folds
 

@@ -8,7 +8,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from psfcore.drawing.charts import (
+from psfcore.drawing.page import PLOT_DPI
+from psfcore.drawing.plots import (
     FARTHEST_PX,
     NEAREST_PX,
     along_distance,
@@ -18,9 +19,10 @@ from psfcore.drawing.charts import (
     draw_totals,
     draw_weights_of_shells,
     legend,
+    png_of,
+    points,
+    tidy,
 )
-from psfcore.drawing.page import PLOT_DPI
-from psfcore.drawing.plots import png_of, points, tidy
 from psfcore.evaluation.evaluation import Evaluation, Superposed
 from psfcore.evaluation.plots import (
     draw_absolute,
@@ -38,7 +40,7 @@ from psfcore.scatter.fit import RADII_PX, TransitFit
 from psfcore.scatter.shapes import Vector
 from psfcore.scatter.total_psf import DIFFRACTION, SCATTER
 from psfcore.scatter.validation.cross_validation import ShellBands
-from psfcore.scatter.validation.dark_offsets import DarkOffsetStudy
+from psfcore.scatter.validation.robustness import DarkOffsetStudy
 from psfcore.tables.make import TOTAL
 
 WIDTH_IN = 9.9

@@ -28,10 +28,9 @@ from psfcore.evaluation.report import report as evaluation_json
 from psfcore.evaluation.report import sentence
 from psfcore.evaluation.shapes import held_out_kernels
 from psfcore.psf import PLATE_SCALE_TOLERANCE, REACH_GRID_PX, Psf
-from psfcore.scatter.fit import TransitFit, fit_transit, fitted_psf
+from psfcore.scatter.fit import TransitFit, fit_json, fit_transit, fitted_psf
 from psfcore.scatter.inversion import Inverter
 from psfcore.scatter.reconstruction import Progress, Solution
-from psfcore.scatter.report import fit_json
 from psfcore.scatter.validation.cross_validation import (
     Bands,
     FoldFit,
@@ -39,7 +38,7 @@ from psfcore.scatter.validation.cross_validation import (
     bootstrap_samples,
     shared_fits,
 )
-from psfcore.scatter.validation.dark_offsets import OFFSETS_DN, DarkOffsetStudy, dark_offset_study
+from psfcore.scatter.validation.robustness import OFFSETS_DN, DarkOffsetStudy, dark_offset_study
 from psfcore.tables.make import tables_of
 from psfcore.transit.prepare import Prepared
 from psfcore.transit.transit import Kernel, Transit

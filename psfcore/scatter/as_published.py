@@ -43,11 +43,19 @@ from psfcore.deconvolve.conditions import Conditions, PreparedPsfs
 from psfcore.deconvolve.methods.richardson_lucy import deconvolve
 from psfcore.errors import DataError
 from psfcore.image import Image
-from psfcore.psf import CENTRE_TOLERANCE, REACH_GRID_PX, Psf, crop_or_pad, cumulative_curve, squared_radii
+from psfcore.psf import (
+    CENTRE_TOLERANCE,
+    CURVE_RADII_PX,
+    REACH_GRID_PX,
+    Psf,
+    crop_or_pad,
+    cumulative_curve,
+    squared_radii,
+)
 from psfcore.scatter.reconstruction import Progress
 from psfcore.scatter.segments import Segments, segment_sums, shells_as_published
 from psfcore.scatter.shapes import Vector
-from psfcore.scatter.total_psf import CURVE_RADII_PX, Kernel
+from psfcore.scatter.total_psf import Kernel
 from psfcore.transit.occulter import FoundPlace, disc_distance, find_occulter, fully_dark
 from psfcore.transit.transit import Frame, Transit
 

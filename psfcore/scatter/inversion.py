@@ -44,7 +44,6 @@ from numpy.typing import NDArray
 
 from psfcore.errors import DataError
 from psfcore.psf import cumulative_curve
-from psfcore.scatter.optics import Blur, Optics, noise_covariance
 from psfcore.scatter.reconstruction import (
     FrameFit,
     Inversion,
@@ -55,7 +54,7 @@ from psfcore.scatter.reconstruction import (
     TransitScenes,
 )
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Shape, Vector
-from psfcore.scatter.total_psf import Kernel, TotalPsf
+from psfcore.scatter.total_psf import Blur, Kernel, Optics, TotalPsf, noise_covariance
 from psfcore.transit.transit import Transit
 
 ALGORITHM_VERSION = 1  # of `invert`: a change of its results needs a new number, because solutions are kept

@@ -27,13 +27,12 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
 from psfcore.errors import DataError
-from psfcore.scatter.optics import Optics, Pixels
+from psfcore.files import whole_file
 from psfcore.scatter.reconstruction import FrameFit, Inversion, Round, Solution, TransitScenes
 from psfcore.scatter.shapes import shape_named
-from psfcore.scatter.total_psf import TotalPsf
+from psfcore.scatter.total_psf import Optics, Pixels, TotalPsf
 from psfcore.transit.occulter import FoundPlace
 from psfcore.transit.transit import Transit
-from psfcore.whole_files import whole_file
 
 MOST_BYTES = 4 * 2**30  # of a file; S3 takes up to 5 GiB in one request
 _CONTENTS = "contents"

@@ -11,8 +11,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 from numpy.typing import NDArray
 
-from psfcore.drawing.charts import (
+from psfcore.drawing.plots import (
     FARTHEST_PX,
+    INK,
     NEAREST_PX,
     along_distance,
     by_pointing,
@@ -23,13 +24,14 @@ from psfcore.drawing.charts import (
     headed_figure,
     legend,
     marker_size,
+    points,
+    tidy,
+    write_png,
 )
-from psfcore.drawing.plots import INK, points, tidy, write_png
 from psfcore.psf import REACH_GRID_PX, cumulative_curve, radial_profile
 from psfcore.scatter.as_published import Published
-from psfcore.scatter.fit import TransitFit
+from psfcore.scatter.fit import TransitFit, fit_sentence
 from psfcore.scatter.inversion import CONVERGED_POINTS
-from psfcore.scatter.report import fit_sentence
 from psfcore.scatter.shapes import Vector
 from psfcore.scatter.validation.cross_validation import LIMITS, Bands, FoldFit, ShellBands
 from psfcore.transit.first_guess import ESTIMATORS

@@ -13,9 +13,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.scatter.optics import Blur, Lanes, Optics, Pixels, pick, put
 from psfcore.scatter.shapes import Shape, Vector
-from psfcore.scatter.total_psf import Kernel, TotalPsf
+from psfcore.scatter.total_psf import Blur, Kernel, Lanes, Optics, Pixels, TotalPsf, pick, put
 from psfcore.transit.occulter import LARGEST_SHIFT_PX, FoundPlace, find_occulter, fully_dark
 from psfcore.transit.transit import Frame, Transit
 
@@ -39,7 +38,7 @@ def labelled(progress: Progress, label: str) -> Progress:
 class TransitScenes:
     """All images of a transit, with their latest scenes and occulter positions.
 
-    Images and scenes are stored in the memory order of the convolution engine (see `psfcore.scatter.optics`).
+    Images and scenes are stored in the memory order of the convolution engine (see `psfcore.scatter.total_psf`).
     """
 
     transit: Transit

@@ -39,8 +39,7 @@ from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import Convolver
 from psfcore.errors import DataError
-from psfcore.psf import REACH_GRID_PX, cumulative_curve, encircled_energy
-from psfcore.simulate.disc import fully_dark
+from psfcore.psf import CURVE_RADII_PX, REACH_GRID_PX, cumulative_curve, encircled_energy
 from psfcore.simulate.plan import HIGH
 from psfcore.simulate.scatter_truth import (
     PARAMETERS,
@@ -49,13 +48,12 @@ from psfcore.simulate.scatter_truth import (
     convolved,
     kernel_slopes,
 )
-from psfcore.simulate.sky import TrueSky, on_field
+from psfcore.simulate.sky import TrueSky, fully_dark, on_field
 
 Plane = NDArray[np.float64]
 Kernel = NDArray[np.float64]
 Window = tuple[slice, slice]
 
-CURVE_RADII_PX = (0.5, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 300.0)
 PLACE_MARGIN_PX = 5.0
 _LAW = 3  # number of parameters of the power law: b, c and total are the first three of PARAMETERS
 

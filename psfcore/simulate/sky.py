@@ -1,4 +1,4 @@
-"""The sky of a simulated transit, and its noise-free images.
+"""The sky of a simulated transit, the light that the dark disc hides, and the noise-free images.
 
     I_i = P (S_f - h_i)        Eq. (1)
 
@@ -11,6 +11,17 @@ pointing is convolved once for all its images; only the hidden light is convolve
 | P S_f | seen_scenes[f]: convolved scene | DN/s |
 | h_i | Behind.hidden: light that the disc hides in image i | DN/s |
 | I_i | expected(i), noise_free[i]: noise-free image i | DN/s |
+
+The share of a pixel behind the disc is exact: the area of the intersection of the disc and the square pixel.
+F(x, y) is the area of the part of the disc that lies left of x and below y. In closed form:
+
+    share = F(x1, y1) - F(x0, y1) - F(x1, y0) + F(x0, y0)                              Eq. (2)
+    F(x, y) = integral from -r to x of max(0, min(y, s) + s) dX,  s = sqrt(r^2 - X^2)   Eq. (3)
+
+| symbol | name | unit |
+|---|---|---|
+| x0, x1, y0, y1 | edges of a pixel, from the disc's centre | px |
+| r | radius_px | px |
 """
 
 from __future__ import annotations
@@ -25,15 +36,17 @@ from numpy.typing import NDArray
 from psfcore.convolution.convolver import Convolver
 from psfcore.errors import DataError
 from psfcore.psf import REACH_GRID_PX
-from psfcore.simulate.disc import Behind, behind, binned
 from psfcore.simulate.plan import Plan
 from psfcore.simulate.scatter_truth import ScatterTruth, total_kernel
 from psfcore.simulate.scene import drawn_scene
+from psfcore.transit.transit import Place
 
 Plane = NDArray[np.float64]
 Kernel = NDArray[np.float64]
 
 _SUM_TOLERANCE = 1e-3
+_PLACE_STEP_PX = 1e-3
+_ROUNDING = 1e-11  # rounding error of a share, which is a difference of areas of about 100 px^2
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,3 +161,104 @@ def _check_diffraction(diffraction: Kernel) -> None:
     total = float(diffraction.sum())
     if abs(total - 1) > _SUM_TOLERANCE:
         raise DataError("bad-diffraction", f"expected weights that sum to 1 on their grid; got {total:.6g}")
+
+
+def covered_share(place: Place, first: tuple[int, int], shape: tuple[int, int], fine: int = 1) -> Plane:
+    """The share (0 to 1) of each fine pixel that is behind the disc, Eq. (2); array of (fine * ny, fine * nx).
+
+    Each detector pixel is divided into `fine` fine pixels along each axis. first: (row, column) of the first detector
+    pixel. shape: (ny, nx), the number of detector pixels. The shares are exact except for rounding. A pixel entirely
+    inside the disc gets exactly 1, a pixel entirely outside exactly 0.
+    """
+    y = first[0] - 0.5 + np.arange(fine * shape[0] + 1) / fine - place.y_px
+    x = first[1] - 0.5 + np.arange(fine * shape[1] + 1) / fine - place.x_px
+    corner = _area_left_below(x[None, :], y[:, None], place.radius_px)
+    area = corner[1:, 1:] - corner[1:, :-1] - corner[:-1, 1:] + corner[:-1, :-1]
+    share = area * fine**2
+    return np.where(share < _ROUNDING, 0.0, np.where(share > 1 - _ROUNDING, 1.0, share))
+
+
+def _area_left_below(x: Plane, y: Plane, r: float) -> Plane:
+    """F(x, y), Eq. (3)."""
+    x, y = np.broadcast_arrays(np.clip(x, -r, r), np.clip(y, -r, r))
+    half = np.sqrt(r**2 - y**2)  # half the length of the chord at y
+    middle = np.clip(x, -half, half)
+    area = y * (middle + half) + _half_segment(middle, r) - _half_segment(-half, r)
+    caps = _half_segment(np.minimum(x, -half), r) - _half_segment(np.full_like(x, -r), r)
+    caps = caps + _half_segment(np.maximum(x, half), r) - _half_segment(half, r)
+    return np.asarray(np.where(y >= 0, area + 2 * caps, area))
+
+
+def _half_segment(x: Plane, r: float) -> Plane:
+    """Integral of sqrt(r^2 - X^2) from 0 to x."""
+    root = np.sqrt(np.maximum(r**2 - x**2, 0.0))
+    return np.asarray((x * root + r**2 * np.arcsin(np.clip(x / r, -1, 1))) / 2)
+
+
+def fully_dark(place: Place, first: tuple[int, int], shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """True for pixels [y, x] whose four corners all lie inside the disc. first, shape: see covered_share."""
+    y = np.abs(first[0] + np.arange(shape[0]) - place.y_px) + 0.5
+    x = np.abs(first[1] + np.arange(shape[1]) - place.x_px) + 0.5
+    return np.asarray(np.hypot(x[None, :], y[:, None]) <= place.radius_px)
+
+
+@dataclass(frozen=True, eq=False)
+class Behind:
+    """A patch of the scene around one position of the disc: fine pixels [y, x] in DN/s.
+
+    first: (row, column) in the field of the first detector pixel of the patch. fine: number of fine pixels in a detector
+    pixel along each axis.
+    """
+
+    first: tuple[int, int]
+    scene: Plane
+    fine: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(ny, nx) in detector pixels."""
+        return self.scene.shape[0] // self.fine, self.scene.shape[1] // self.fine
+
+    def window(self, margin_px: int = 0) -> tuple[slice, slice]:
+        """The slices of the patch in a plane that is margin_px larger than the field on each side."""
+        (top, left), (ny, nx) = self.first, self.shape
+        return (slice(top + margin_px, top + margin_px + ny), slice(left + margin_px, left + margin_px + nx))
+
+    def hidden(self, place: Place) -> Plane:
+        """The light that a disc at `place` hides in each detector pixel of the patch, DN/s."""
+        return binned(self.scene * covered_share(place, self.first, self.shape, self.fine), self.fine)
+
+    def hidden_slopes(self, place: Place) -> tuple[Plane, Plane]:
+        """The derivatives of ``hidden`` with respect to the disc's x and y, DN/s per px.
+
+        The derivatives are central differences between positions 0.001 px to either side.
+        """
+        return self._slope(place, _PLACE_STEP_PX, 0.0), self._slope(place, 0.0, _PLACE_STEP_PX)
+
+    def _slope(self, place: Place, dx: float, dy: float) -> Plane:
+        ahead = self.hidden(Place(place.x_px + dx, place.y_px + dy, place.radius_px))
+        back = self.hidden(Place(place.x_px - dx, place.y_px - dy, place.radius_px))
+        return (ahead - back) / (2 * (dx + dy))
+
+
+def behind(fine_scene: Plane, place: Place, *, fine: int, margin_px: int) -> Behind:
+    """The patch of a scene that the disc can hide when its centre lies less than a pixel from `place`.
+
+    fine_scene: fine pixels [y, x], DN/s; it extends margin_px detector pixels beyond the field on each side.
+    fine: number of fine pixels in a detector pixel along each axis.
+    """
+    reach = place.radius_px + 2
+    field = (fine_scene.shape[0] // fine - 2 * margin_px, fine_scene.shape[1] // fine - 2 * margin_px)
+    spans = []
+    for at, n in zip((place.y_px, place.x_px), field, strict=True):
+        spans.append((max(0, int(np.floor(at - reach))), min(n, int(np.ceil(at + reach)) + 1)))
+    rows, columns = (slice((low + margin_px) * fine, (high + margin_px) * fine) for low, high in spans)
+    return Behind((spans[0][0], spans[1][0]), fine_scene[rows, columns].copy(), fine)
+
+
+def binned(fine_plane: Plane, fine: int) -> Plane:
+    """The mean of each block of (fine, fine) pixels."""
+    if fine == 1:
+        return fine_plane
+    ny, nx = fine_plane.shape
+    return np.asarray(fine_plane.reshape(ny // fine, fine, nx // fine, fine).mean(axis=(1, 3)))

@@ -30,7 +30,10 @@ from psfcore.transit.manifest import (
     parse_manifest,
     read_manifest,
 )
-from psfcore.transit.members import START_BYTES, Kind, archive_kind, could_be_archive, opened
+from psfcore.transit.members import START_BYTES as START_BYTES
+from psfcore.transit.members import Kind, opened
+from psfcore.transit.members import archive_kind as archive_kind
+from psfcore.transit.members import could_be_archive as could_be_archive
 
 _CHUNK = 1 << 20
 _GZIP = b"\x1f\x8b"
@@ -241,18 +244,3 @@ def _pack_into(folder: Path, manifest: TransitManifest, target: IO[bytes]) -> No
                 entry.size = file.seek(0, io.SEEK_END)
                 file.seek(0)
                 archive.addfile(entry, file)
-
-
-__all__ = [
-    "START_BYTES",
-    "ArchiveContents",
-    "ArchiveLimits",
-    "FolderTransit",
-    "archive_kind",
-    "checked_folder",
-    "could_be_archive",
-    "list_archive",
-    "pack",
-    "transit_in",
-    "unpack",
-]

@@ -31,8 +31,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.arrays import json_attributes
 from psfcore.errors import DataError
-from psfcore.json_values import json_attributes
 from psfcore.transit.transit import Frame, Place, Transit
 
 CENTRE_PX = 2.0

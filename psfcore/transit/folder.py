@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from psfcore.errors import DataError, together
+from psfcore.files import sha256_of
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.frame import plate_scale_arcsec
 from psfcore.fits.header import HeaderSummary, instant, read_summary
@@ -25,7 +26,6 @@ from psfcore.transit.archive import checked_folder
 from psfcore.transit.manifest import MANIFEST_NAME, ImageEntry, TransitManifest
 from psfcore.transit.prepare import Exposure, Prepared, exposure_of, prepare
 from psfcore.transit.transit import Kernel, Place, Transit, check_reaches_in
-from psfcore.whole_files import sha256_of
 
 KNOWN_PSF_SUM_TOLERANCE = 1e-3
 SMALLEST_KNOWN_PSF_PX = 16

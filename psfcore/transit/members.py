@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import IO, BinaryIO, Literal, Self, cast
 
 from psfcore.errors import DataError
-from psfcore.gunzip import GzipStream
+from psfcore.files import GzipStream
 from psfcore.transit.admission import Admitted, ArchiveLimits, Gate, not_plain, shown
 
 Kind = Literal["zip", "tar", "tar.gz"]

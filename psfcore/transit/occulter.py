@@ -32,8 +32,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from psfcore.arrays import scaled_inverse
 from psfcore.convolution.convolver import Convolver
-from psfcore.least_squares import scaled_inverse
 from psfcore.noise import Noise
 from psfcore.transit.transit import Frame, Place
 

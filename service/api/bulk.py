@@ -23,7 +23,7 @@ from workers.bulk.runs import begin, cancel_turns
 from workers.catalogue.bulk_progress import BATCH, BulkProgress
 from workers.catalogue.tables import BulkItemRow, BulkRow
 from workers.contract.bulk import STOPPED, BulkPhase, BulkRequest, ItemState
-from workers.contract.phases import JobError
+from workers.contract.jobs import JobError
 from workers.rows import no_such
 
 log = logging.getLogger(__name__)

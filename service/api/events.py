@@ -45,7 +45,7 @@ from service.http.state import Shared
 from service.views import JobView
 from workers.catalogue.followed import MOST, Followable, Followed, Place, State
 from workers.contract.bulk import BULK_ENDED, BulkPhase
-from workers.contract.phases import Phase
+from workers.contract.jobs import Phase
 
 log = logging.getLogger(__name__)
 LOOK_EVERY_S = 0.5

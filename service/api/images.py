@@ -19,7 +19,7 @@ from workers.catalogue.tables import ImageRow, ProductRow, PsfRow
 from workers.contract.kinds import KINDS
 from workers.contract.requests import Identity, Rerun
 from workers.files.collection import files_of, remove_unnamed
-from workers.intake.deprecated import details_now
+from workers.intake.compatibility import details_now
 from workers.lineage import Ancestor, Format, lineage, provenance_text
 
 MEDIA_TYPES: dict[Format, str] = {"json": "application/json", "provn": "text/provenance-notation"}

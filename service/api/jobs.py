@@ -15,9 +15,8 @@ from service.http.quotas import check_room
 from service.http.state import Shared
 from service.views import Estimate, JobView
 from workers.catalogue.tables import JobRow
+from workers.contract.jobs import Phase, Queue
 from workers.contract.kinds import KINDS, JobRequest, queue_of
-from workers.contract.phases import Phase
-from workers.contract.queues import Queue
 from workers.contract.requests import Deconvolve, ResolvedDeconvolve
 from workers.intake import estimates
 from workers.intake.again import reopened, there, without_results

@@ -20,7 +20,7 @@ from fastapi import APIRouter, Path, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 
-from psfcore.whole_files import sha256_of
+from psfcore.files import sha256_of
 from service.http import files
 from service.http.callers import Caller, Submitting
 from service.http.problems import RESPONSES, Problem, as_problems

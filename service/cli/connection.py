@@ -20,8 +20,8 @@ from service.cli.options import options_of, user_errors
 from service.cli.progress import echo, say
 from service.client.errors import DEFAULT_SERVER, SHOWN_DIGITS
 from service.client.operations import Operations
-from workers.cache_folder import published_folder
 from workers.contract.requests import FEWEST_DIGITS, Deconvolve
+from workers.machine import published_folder
 
 if TYPE_CHECKING:
     from service.client.http import Client

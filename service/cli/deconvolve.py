@@ -13,7 +13,7 @@ import click
 
 from psfcore.deconvolve.summary import summary_lines
 from psfcore.errors import DataError
-from psfcore.whole_files import sha256_of
+from psfcore.files import sha256_of
 from service.cli.connection import LOCAL, PSF, SERVER, connection, named_psf, short
 from service.cli.options import (
     DRAWN,
@@ -41,7 +41,7 @@ from service.start import STARTED
 from workers.contract.requests import Deconvolve
 
 if TYPE_CHECKING:
-    from psfcore.deconvolve.assess.contact_sheet import Treated
+    from psfcore.deconvolve.assess.pictures import Treated
 
 # Every field of the request is an option, except what the command fills in itself.
 _FILLED_IN = ("image_id", "psf_id", "changes_picture")
@@ -215,7 +215,7 @@ def changes(
     Images with the highest artefact score come first. Images that cannot be deconvolved are listed with the reason.
     Each image gets the same PSF and the same treatment as by `heliopsf deconvolve`.
     """
-    from psfcore.deconvolve.assess.contact_sheet import contact_sheet_png, table, treat_many
+    from psfcore.deconvolve.assess.pictures import contact_sheet_png, table, treat_many
 
     files = [str(path) for path in fits_files(images)]
     if not files:
@@ -255,7 +255,7 @@ def _one_by_one(
 ) -> Callable[[str], Treated]:
     """A function that deconvolves one image with the service and measures what changed. The function adds the ids of
     the products to ``products``."""
-    from psfcore.deconvolve.assess.contact_sheet import changes_in_product
+    from psfcore.deconvolve.assess.pictures import changes_in_product
 
     def one(name: str) -> Treated:
         with TemporaryDirectory(prefix="heliopsf-") as folder:

@@ -22,7 +22,7 @@ from service.cli.options import (
 )
 from service.cli.progress import duration, echo, step_text
 from service.client.errors import ServiceError
-from workers.contract.phases import Phase
+from workers.contract.jobs import Phase
 
 if TYPE_CHECKING:
     from service.client.http import Client

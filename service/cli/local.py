@@ -24,10 +24,11 @@ from pydantic import TypeAdapter, ValidationError
 from psfcore import limited
 from psfcore.compiled import listening
 from psfcore.deconvolve import run
-from psfcore.deconvolve.box import Box
 from psfcore.deconvolve.conditions import PreparedPsfs
+from psfcore.deconvolve.extent import Box
 from psfcore.deconvolve.run import BUILDING, Identities, UsedPsf
 from psfcore.errors import DataError, module_of_extra
+from psfcore.files import sha256_of
 from psfcore.fits.blocks import LIMITS
 from psfcore.fits.frame import frame_of
 from psfcore.fits.header import HeaderSummary, check_not_deconvolved, optional_text, read_summary
@@ -41,11 +42,9 @@ from psfcore.instruments.workload import check_workload
 from psfcore.psf import Kernel, Psf, light_beyond_pct
 from psfcore.psf_cache import built_file, kept_psf
 from psfcore.transit.archive import ArchiveContents, list_archive, transit_in, unpack
-from psfcore.whole_files import sha256_of
 from service.client.errors import ServiceError
 from service.client.operations import Operations, Progress, named_instrument
 from service.client.outputs import written
-from workers.cache_folder import psf_cache
 from workers.contract.identities import (
     build_for,
     check_noise,
@@ -72,7 +71,7 @@ from workers.contract.requests import (
 from workers.contract.suggestions import explained
 from workers.files.archive import safe_name
 from workers.intake.costs import COSTS, linear_s
-from workers.machine import cores, free_bytes
+from workers.machine import cores, free_bytes, psf_cache
 from workers.settings import Settings, software_version
 from workers.stage_timer import StageTimer
 from workers.versions import PsfStatus, instrument_of, name_of_upload
@@ -443,11 +442,9 @@ class Local(Operations):
     def _psf_fit(self, request: ResolvedPsfFit, job_id: str, report: _Report) -> str:
         from psfcore.fits.psfs import write_psf
         from workers.tasks import psf_fit
-        from workers.tasks.results import write_json
+        from workers.tasks.results import Means, write_json
 
-        fitted = psf_fit.fit(
-            request, *self._transit(request, report), job_id=job_id, threads=cores(), progress=report
-        )
+        fitted = psf_fit.fit(request, *self._transit(request, report), Means(job_id, cores(), report))
         return self._add_psf(
             fitted.psf,
             fitted.psf.provenance["psf_id"],
@@ -482,24 +479,23 @@ class Local(Operations):
 
     def _report(self, request: ResolvedReport, job_id: str, report: _Report) -> str:
         from workers.tasks import report as task
+        from workers.tasks.results import Means
 
         psf = None if request.psf_id is None else self._psf(request.psf_id, parts=True)
         transit = self._transit(request, report, None if psf is None else task.point())
-        return self._add_report(
-            task.make(request, *transit, psf, job_id=job_id, threads=cores(), progress=report)
-        )
+        return self._add_report(task.make(request, *transit, psf, Means(job_id, cores(), report)))
 
     def _gap_diagnose(self, request: ResolvedGapDiagnose, job_id: str, report: _Report) -> str:
         from psfcore.fits.psfs import write_psf
         from psfcore.gap.library.registry import added_effects
         from workers.tasks.gap import diagnosis_of
+        from workers.tasks.results import Means
 
         added = added_effects(request.added_effects)
         parent = None if request.psf_id is None else self._psf(request.psf_id, parts=True)
         transit, _ = self._transit(request, report)
-        found, corrected = diagnosis_of(
-            request, transit, parent, added, job_id=job_id, threads=cores(), progress=report
-        )
+        means = Means(job_id, cores(), report)
+        found, corrected = diagnosis_of(request, transit, parent, added, means)
         if corrected is not None:
             address = f"/v1/psfs/{corrected.provenance['psf_id']}"
             self._add(address, {}, file=lambda path: write_psf(path, corrected))

@@ -15,8 +15,8 @@ import click
 from sqlalchemy import make_url
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
+from psfcore.files import sha256_of
 from psfcore.fits.header import read_summary
-from psfcore.whole_files import sha256_of
 from service.cli.options import DATA, read_settings, user_errors
 from service.cli.progress import echo
 from service.cli.psf.query import NAMES, SOURCE, brought

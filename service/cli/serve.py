@@ -28,7 +28,7 @@ from service.cli.progress import echo
 from service.client.errors import WaitInterrupted
 from service.client.operations import Progress, without_none
 from service.client.outputs import check_outputs
-from workers.contract.queues import Queue, queues_named
+from workers.contract.jobs import Queue, queues_named
 
 if TYPE_CHECKING:
     from service.client.http import Client
@@ -222,7 +222,7 @@ def _simulated(service: Client, output: Path, progress: Progress) -> Path:
     # The simulation is imported here, because a demo with the user's own image does not need it.
     from psfcore.fits.header import FitsLimits
     from psfcore.fits.psfs import read_psf
-    from psfcore.simulate.observe import demo_image
+    from psfcore.simulate.scene import demo_image
 
     psf_file, image = output / "psf.fits", output / "simulated.fits"
     service.build_psf("hri_euv", psf_file, preview=output / "psf.png", progress=progress, overwrite=True)

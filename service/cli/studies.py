@@ -110,8 +110,8 @@ def arms(
     """Measure the diffraction arms around a flare in IMAGE (FITS): their angles, and the spacing of their peaks."""
     import numpy as np
 
-    from psfcore.drawing.units import unit_label
     from psfcore.fits.observation import read_observation
+    from psfcore.fits.units import unit_label
     from psfcore.flare.arms import measure_arms
     from psfcore.flare.plots import arms_png
 

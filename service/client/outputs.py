@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from psfcore.whole_files import probe, whole_path
+from psfcore.files import probe, whole_path
 from service.client.errors import ServiceError
 
 Name = str | Path

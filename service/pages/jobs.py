@@ -19,7 +19,7 @@ from service.pages.rendering import page
 from service.pages.sentences import of_error
 from service.views import JobView
 from workers.catalogue.tables import ImageRow
-from workers.contract.phases import Phase
+from workers.contract.jobs import Phase
 
 PER_PAGE = 50
 TITLES = {

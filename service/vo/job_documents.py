@@ -15,8 +15,8 @@ from xml.etree.ElementTree import Element, SubElement, register_namespace, tostr
 from service.vo.parameters import NO_XML
 from workers.catalogue.tables import JobRow, TermsRow
 from workers.catalogue.uws_jobs import JobLine
+from workers.contract.jobs import Fault, JobError, Phase
 from workers.contract.kinds import KINDS, Result
-from workers.contract.phases import Fault, JobError, Phase
 
 MEDIA_TYPE = "application/xml"
 UWS = "http://www.ivoa.net/xml/UWS/v1.0"

@@ -38,7 +38,7 @@ from service.vo.parameters import (
     values_of,
 )
 from workers.catalogue.tables import JobRow
-from workers.contract.phases import JobError, Phase
+from workers.contract.jobs import JobError, Phase
 from workers.rows import no_such
 
 MAX_RUN_ID = 256

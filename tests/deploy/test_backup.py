@@ -22,7 +22,7 @@ from tests.service.conftest import upload
 from tests.whole.stack import Missing, postgres_database
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow
-from workers.contract.phases import Phase
+from workers.contract.jobs import Phase
 from workers.files.store import Store
 from workers.run.runner import Runner
 from workers.settings import Settings

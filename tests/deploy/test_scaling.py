@@ -20,8 +20,7 @@ from tests.workers.jobs import bulk_row
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import JobRow
 from workers.contract.bulk import BulkPhase
-from workers.contract.phases import Phase
-from workers.contract.queues import Queue
+from workers.contract.jobs import Phase, Queue
 from workers.settings import Settings
 
 KUBERNETES = Path(__file__).parents[2] / "deploy" / "kubernetes"

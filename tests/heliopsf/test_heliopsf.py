@@ -69,7 +69,7 @@ def test_the_functions_load_no_server() -> None:
     assert "psfcore.scatter.fit" in loaded
     assert loaded & {"fastapi", "sqlalchemy", "celery", "httpx", "service", "sunpy", "matplotlib"} == set()
     ours = {name for name in loaded if name.startswith("workers.")}
-    assert ours == {"workers.cache_folder", "workers.machine"}
+    assert ours == {"workers.machine"}
 
 
 def test_the_core_needs_no_extra() -> None:

@@ -15,9 +15,9 @@ import heliopsf
 from psfcore.instruments import files
 from service.cli.local import local
 from tests.conftest import SMALL_INSTRUMENT, write_image
-from workers.cache_folder import psf_cache
 from workers.contract.identities import psf_identity
 from workers.contract.requests import PsfBuild
+from workers.machine import psf_cache
 
 MATCH = '\n[match]\nDETECTOR = "SMALL"\n'
 

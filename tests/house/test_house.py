@@ -69,16 +69,14 @@ def test_imports_run_one_way(subtests: pytest.Subtests) -> None:
             assert wrong == []
 
 
-def test_what_people_import_stands_on_the_core_the_client_the_folder_of_the_cache_and_the_machine_alone() -> (
-    None
-):
+def test_what_people_import_stands_on_the_core_the_client_and_the_machine_alone() -> None:
     libraries = {"astropy", "heliopsf", "matplotlib", "numpy", "psfcore"}
     wrong = [
         (path.name, name)
         for path in sources("heliopsf")
         for name in imports(path)
         if name.split(".")[0] not in libraries | sys.stdlib_module_names
-        and not name.startswith(("service.client", "workers.cache_folder", "workers.machine"))
+        and not name.startswith(("service.client", "workers.machine"))
     ]
     assert wrong == []
 
@@ -100,7 +98,7 @@ LIGHT = (
     "psfcore.noise",
     "psfcore.transit.archive",
     "psfcore.transit.manifest",
-    "psfcore.whole_files",
+    "psfcore.files",
 )
 
 

@@ -26,7 +26,7 @@ from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.contexts import Pin
 from workers.catalogue.psfs import StatusAsked
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow, ProductRow, PsfRow, ReportRow
-from workers.contract.phases import Phase
+from workers.contract.jobs import Phase
 from workers.files.store import Store
 from workers.run.runner import Runner
 from workers.settings import Settings

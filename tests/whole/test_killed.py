@@ -13,7 +13,7 @@ import pytest
 from tests.conftest import write_image
 from tests.whole.stack import EMBEDDED_FIRST, Stack, items, running, wait_for
 from workers.catalogue.tables import JobRow
-from workers.contract.phases import Phase
+from workers.contract.jobs import Phase
 
 IMAGES = 8
 AT_WORK = 3  # images of a bulk run that one process reads, computes and writes at the same time

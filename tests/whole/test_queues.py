@@ -11,8 +11,7 @@ from sqlalchemy import create_engine, func, select
 from tests.conftest import write_image
 from tests.whole.stack import MODES, Stack, running, wait_for
 from workers.catalogue.tables import JobRow
-from workers.contract.phases import Phase
-from workers.contract.queues import Queue
+from workers.contract.jobs import Phase, Queue
 
 WAITING = 1000
 

@@ -16,7 +16,7 @@ from kombu import Queue as BrokerQueue
 from kombu.exceptions import KombuError, OperationalError
 from redis.exceptions import RedisError
 
-from workers.contract.queues import Queue, broker_name
+from workers.contract.jobs import Queue, broker_name
 from workers.settings import Settings
 
 RUN_JOB = "heliopsf.run_job"

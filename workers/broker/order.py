@@ -27,9 +27,9 @@ from kombu.transport import filesystem, redis
 from kombu.utils.json import dumps
 from kombu.utils.scheduling import FairCycle, priority_cycle
 
-from psfcore.whole_files import write_whole
+from psfcore.files import write_whole
 from workers.broker.app import ASSIST, RUN_JOB
-from workers.contract.queues import broker_name, by_urgency, queue_of_broker
+from workers.contract.jobs import broker_name, by_urgency, queue_of_broker
 
 log = logging.getLogger(__name__)
 

@@ -18,7 +18,7 @@ from typing import Any
 from pydantic import BaseModel, Field
 
 from psfcore.errors import DataError
-from psfcore.fits.blocks import FitsLimits
+from psfcore.fits.blocks import BLOCK_BYTES, FitsLimits
 from psfcore.fits.header import read_summary
 from workers.bulk.listing import found_files, no_images
 from workers.bulk.outputs import target_of
@@ -28,7 +28,7 @@ from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ImageRow, ProductRow
 from workers.contract.bulk import BulkRequest
 from workers.contract.identities import product_identity
-from workers.contract.phases import JobError
+from workers.contract.jobs import JobError
 from workers.contract.requests import ResolvedDeconvolve
 from workers.files import archive as archive_files
 from workers.intake import estimates
@@ -39,7 +39,6 @@ BUDGET_S = 20.0  # a dry run stops after this time, and reports what it found
 MOST_REFUSED = 100  # refused images that are named
 # Bytes of a product: float32 pixels, the plane QUALITY, and with errors the planes ERROR and PSF_ERROR.
 IMAGE_BYTES, QUALITY_BYTES, ERROR_BYTES = 4, 1, 4
-BLOCK_BYTES = 2880  # the length of a FITS file is a multiple of this
 HEADER_BYTES = 2 * BLOCK_BYTES  # a usual header of an image; the headers of planes are as long
 NO_ID = "0" * 64  # takes the place of the SHA-256 of a file, which is not read
 

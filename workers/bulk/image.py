@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from psfcore.files import sha256_of
 from psfcore.fits.header import read_summary
 from psfcore.image import Image
-from psfcore.whole_files import sha256_of
 from workers.bulk import outputs
 from workers.bulk.runs import resolved_image
 from workers.catalogue.tables import BulkItemRow, BulkRow, ImageRow, ProductRow
@@ -26,7 +26,7 @@ from workers.contract.requests import ResolvedDeconvolve
 from workers.files import archive as archive_files
 from workers.files.store import is_disk_full
 from workers.intake import estimates
-from workers.intake.deprecated import details_now
+from workers.intake.compatibility import details_now
 from workers.rows import row_of
 from workers.tasks import deconvolve as deconvolve_task
 from workers.tasks.context import Context

@@ -19,7 +19,7 @@ from psfcore.fits.header import FitsLimits
 from workers.catalogue.bulks import NOT_UTF_8, TOO_LONG, Listed
 from workers.catalogue.tables import MOST_LETTERS, BulkRow
 from workers.contract.bulk import BulkWork, Condition
-from workers.contract.phases import JobError
+from workers.contract.jobs import JobError
 from workers.files import archive as archive_files
 from workers.settings import Settings
 

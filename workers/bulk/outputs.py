@@ -9,8 +9,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from psfcore.errors import DataError
+from psfcore.files import sha256_of
 from psfcore.fits.header import FitsLimits, first_image_header, optional_text
-from psfcore.whole_files import sha256_of
 from workers.contract.bulk import MOST_IN_PATH, FieldValue, Output, laid_out
 from workers.files import archive as archive_files
 from workers.files.store import is_disk_full

@@ -20,8 +20,7 @@ from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import BulkRow, ImageRow, JobRow, PsfRow
 from workers.contract.bulk import BulkPhase, BulkRequest, BulkWork
 from workers.contract.identities import canonical_hash
-from workers.contract.phases import Fault, JobError, Phase
-from workers.contract.queues import Queue
+from workers.contract.jobs import Fault, JobError, Phase, Queue
 from workers.contract.requests import Deconvolve, ResolvedDeconvolve
 from workers.files import archive as archive_files
 from workers.files.store import STORAGE_FULL

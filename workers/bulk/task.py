@@ -25,7 +25,7 @@ from workers.bulk.image import Destination, Outcome, Ready, compute_one, done_be
 from workers.bulk.listing import list_files
 from workers.catalogue.tables import BulkItemRow, BulkRow
 from workers.contract.bulk import AT_WORK, BulkPhase, BulkWork
-from workers.contract.phases import Fault, JobError
+from workers.contract.jobs import Fault, JobError
 from workers.stage_timer import STARTING
 from workers.tasks.context import Context, TurnOver
 from workers.tasks.deconvolve import Made

@@ -24,7 +24,7 @@ from workers.catalogue.jobs import Lease
 from workers.catalogue.owners import lock_owner
 from workers.catalogue.tables import BulkItemRow, BulkRow, JobRow
 from workers.contract.bulk import AT_WORK, DELETABLE, OPEN, STOPPED, BulkPhase, ItemState
-from workers.contract.phases import Fault, JobError, Phase
+from workers.contract.jobs import Fault, JobError, Phase
 
 # Errors of files whose paths the catalogue cannot store. Such files are not retried, because the stored path is wrong.
 NOT_UTF_8, TOO_LONG = "path-not-utf-8", "path-too-long"

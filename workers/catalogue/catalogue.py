@@ -23,9 +23,8 @@ from workers.catalogue.census import Census, KeptStageTimes
 from workers.catalogue.contexts import Contexts, Series
 from workers.catalogue.database import Database, begins_with, newest_first
 from workers.catalogue.followed import followed_bulks, followed_jobs
-from workers.catalogue.jobs import Jobs
+from workers.catalogue.jobs import Jobs, Parts
 from workers.catalogue.owners import NamedFiles, Owners, hold_to_quota, lock_owner
-from workers.catalogue.parts import Parts
 from workers.catalogue.psfs import Psfs, existing_psf
 from workers.catalogue.schema import Schema
 from workers.catalogue.tables import (
@@ -44,7 +43,7 @@ from workers.catalogue.uws_jobs import UwsJobs
 from workers.catalogue.waiting import Places, Turns
 from workers.contract.bulk import OPEN
 from workers.contract.identities import canonical_hash
-from workers.contract.phases import ENDED, Phase
+from workers.contract.jobs import ENDED, Phase
 from workers.versions import PsfStatus
 
 Row = TypeVar("Row", ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, SolutionRow)

@@ -21,8 +21,7 @@ from workers.catalogue.tables import (
     TransitRow,
     WorkerRow,
 )
-from workers.contract.phases import Phase
-from workers.contract.queues import Queue
+from workers.contract.jobs import Phase, Queue
 from workers.stage_timer import Spent
 
 

@@ -16,8 +16,8 @@ from sqlalchemy import ColumnElement, select, tuple_
 from workers.catalogue.database import Database
 from workers.catalogue.tables import BulkRow, JobRow
 from workers.contract.bulk import OPEN
+from workers.contract.jobs import Phase
 from workers.contract.kinds import KINDS
-from workers.contract.phases import Phase
 
 MOST = 300
 

@@ -60,7 +60,7 @@ from workers.catalogue.tables import (
     TransitRow,
 )
 from workers.contract.bulk import BULK_ENDED
-from workers.contract.phases import ENDED
+from workers.contract.jobs import ENDED
 
 MIB = 2**20
 MOST_QUOTA_MIB = 2**31 - 1  # the largest number in the column of quotas

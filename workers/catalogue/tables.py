@@ -11,8 +11,7 @@ from typing import Any
 from sqlalchemy import JSON, BigInteger, Double, Index, String, false, text
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
-from workers.contract.phases import LIVE
-from workers.contract.queues import Queue
+from workers.contract.jobs import LIVE, Queue
 
 DEFAULT_OWNER = "local"
 MOST_LETTERS = 1024  # longest path of a file of a bulk run

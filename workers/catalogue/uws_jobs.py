@@ -16,8 +16,8 @@ from workers.catalogue.database import Database, newest_first
 from workers.catalogue.jobs import Jobs
 from workers.catalogue.tables import JobRow, TermsRow
 from workers.contract.identities import canonical_hash
+from workers.contract.jobs import Phase
 from workers.contract.kinds import queue_of
-from workers.contract.phases import Phase
 
 
 @dataclass(frozen=True)

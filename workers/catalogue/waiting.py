@@ -20,8 +20,7 @@ from sqlalchemy.orm import Session
 from workers.catalogue.database import Database, Queries
 from workers.catalogue.jobs import Jobs, Lease, is_at_work, no_equal_at_work
 from workers.catalogue.tables import JobRow, OwnerTurnRow
-from workers.contract.phases import Phase
-from workers.contract.queues import Queue
+from workers.contract.jobs import Phase, Queue
 
 MOST_COUNTED = 1000
 MOST_READ = 10_000  # at most this number of waiting jobs of a queue is read, oldest first, to count the jobs of each owner

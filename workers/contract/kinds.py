@@ -23,7 +23,7 @@ from workers.contract.identities import (
     report_identity,
     request_identity,
 )
-from workers.contract.queues import Queue
+from workers.contract.jobs import Queue
 from workers.contract.requests import (
     CrossValidate,
     Deconvolve,

@@ -13,7 +13,13 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, get_args
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
-from psfcore.deconvolve.box import BOX, LARGEST_ERROR, Box, region_without_discrepancy, region_without_errors
+from psfcore.deconvolve.extent import (
+    BOX,
+    LARGEST_ERROR,
+    Box,
+    region_without_discrepancy,
+    region_without_errors,
+)
 from psfcore.errors import DataError
 from psfcore.instruments.model import MOST_BYTES
 from psfcore.noise import NoiseFigures
@@ -21,7 +27,7 @@ from psfcore.recipe import BUILD_VERSION
 from workers.versions import TIME, iso, seconds
 
 if TYPE_CHECKING:
-    from psfcore.deconvolve.whole import Options
+    from psfcore.deconvolve.work import Options
 
 # Texts of one line from outside: without control characters, of which PostgreSQL cannot store NUL.
 PRINTABLE, PRINTABLE_OR_EMPTY = r"^[^\x00-\x1f\x7f]+$", r"^[^\x00-\x1f\x7f]*$"
@@ -482,7 +488,7 @@ ResolvedOnTransit = ResolvedPsfFit | ResolvedCrossValidate | ResolvedReport | Re
 def options_of(request: Deconvolve, threads: int) -> Options:
     """The options of psfcore for a request."""
     # A request is checked without numerical libraries.
-    from psfcore.deconvolve.whole import Options
+    from psfcore.deconvolve.work import Options
 
     method = request.method
     return Options(

@@ -26,10 +26,10 @@ from pathlib import Path, PurePath
 from typing import Any, BinaryIO
 
 from psfcore.errors import DataError
+from psfcore.files import PARTIAL
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.cards import optional_value
 from psfcore.fits.header import first_image_header
-from psfcore.whole_files import PARTIAL
 from workers.contract.bulk import Condition
 from workers.files.modes import open_file, open_folder, open_made_folder
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from psfcore.errors import DataError
-from psfcore.whole_files import write_whole
+from psfcore.files import write_whole
 
 EXPIRES_S = 86_400.0  # an upload that got no byte for this time is removed
 MOST_OPEN = 20  # open uploads of one owner

@@ -18,7 +18,7 @@ import aiohttp
 import s3fs
 from botocore.exceptions import BotoCoreError
 
-from psfcore.whole_files import sha256_of
+from psfcore.files import sha256_of
 from workers.files.store import DAMAGED, BadFile, Blob, Store, StoreAway, is_disk_full, sync
 
 LOOK_AFTER_S = 10.0  # shortest time between two measurements of the size of the copies

@@ -27,8 +27,8 @@ from typing import Literal
 from sqlalchemy.exc import SQLAlchemyError
 
 from psfcore.errors import DataError, module_of_extra
+from psfcore.files import sha256_of
 from psfcore.transit.archive import ArchiveLimits, unpack
-from psfcore.whole_files import sha256_of
 from workers.settings import Settings
 
 ADVICE = (

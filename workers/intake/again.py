@@ -20,9 +20,8 @@ from workers.catalogue.tables import (
     TransitRow,
 )
 from workers.contract.identities import request_identity
+from workers.contract.jobs import Phase, Queue
 from workers.contract.kinds import KINDS, Result
-from workers.contract.phases import Phase
-from workers.contract.queues import Queue
 from workers.contract.requests import PsfTables
 from workers.files.collection import Fault, intact
 from workers.files.store import Store

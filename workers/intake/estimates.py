@@ -20,12 +20,10 @@ from statistics import median_low
 from typing import Any
 from weakref import WeakKeyDictionary
 
-from psfcore.deconvolve.box import EXPECTED_RIM_PX, Box
-from psfcore.deconvolve.memory import MIB, Demand, of_method, product_bytes
+from psfcore.deconvolve.extent import EXPECTED_RIM_PX, MIB, Box, Demand, of_method, product_bytes
 from psfcore.errors import DataError
 from psfcore.instruments.model import parse_instrument
 from psfcore.instruments.workload import workload
-from psfcore.transit.archive import BYTES_A_PIXEL
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ImageRow, PsfRow, TransitRow
 from workers.contract.identities import instrument_text
@@ -213,10 +211,7 @@ def _pixels(parameters: Mapping[str, Any], catalogue: Catalogue, owner: str) -> 
     """
     if parameters.get("transit_id"):
         transit = catalogue.get(TransitRow, parameters["transit_id"], owner)
-        if transit is None:
-            return 0.0
-        # Transits that were uploaded to a development version have no number of pixels.
-        return float(transit.summary.get("pixels", transit.summary["unpacked_bytes"] / BYTES_A_PIXEL))
+        return 0.0 if transit is None else float(transit.summary["pixels"])
     if parameters.get("image_id"):
         image = catalogue.get(ImageRow, parameters["image_id"], owner)
         return 0.0 if image is None else math.prod(image.summary["shape"])

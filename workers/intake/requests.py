@@ -6,7 +6,7 @@ import uuid
 from dataclasses import dataclass
 from typing import Any
 
-from psfcore.deconvolve.box import Box
+from psfcore.deconvolve.extent import Box
 from psfcore.fits.frame import frame_of
 from psfcore.fits.header import check_not_deconvolved
 from psfcore.gap.effect_sources import sha256_of_source
@@ -26,7 +26,7 @@ from workers.contract.identities import (
 from workers.contract.kinds import KINDS, JobRequest, Kind, load
 from workers.contract.requests import Deconvolve, Parameters, PsfBuild, ResolvedDeconvolve
 from workers.intake import compatibility
-from workers.intake.deprecated import check_not_deprecated
+from workers.intake.compatibility import check_not_deprecated
 from workers.intake.psf_choice import Found, no_psf, picked_for_image
 from workers.lineage import made_by
 from workers.rows import row_of

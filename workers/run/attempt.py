@@ -15,7 +15,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
-from workers.contract.phases import Fault, JobError, Phase
+from workers.contract.jobs import Fault, JobError, Phase
 from workers.run.child import Child, Stopping
 from workers.stage_timer import StageTimer
 

@@ -22,9 +22,8 @@ from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
 from workers.catalogue.owners import NOT_KEPT
 from workers.catalogue.tables import JobRow, ProductRow, PsfRow, ReportRow
+from workers.contract.jobs import Fault, JobError, Phase, Queue
 from workers.contract.kinds import KINDS
-from workers.contract.phases import Fault, JobError, Phase
-from workers.contract.queues import Queue
 from workers.files.store import NO_ROOM, STORAGE_FULL, Store, is_disk_full
 from workers.run.attempt import Assistance, Attempt, Cancelled, Progress, TookTooLong
 from workers.run.child import MARGIN, Child, Stopping, allowed_mib, is_out_of_memory

@@ -23,7 +23,7 @@ from celery.worker import state
 from workers import logs, traces
 from workers.broker import app as queue
 from workers.broker.order import TakeWhatCanStart
-from workers.contract.queues import broker_name, queue_of_broker
+from workers.contract.jobs import broker_name, queue_of_broker
 from workers.run.child import Child, Idle, Stopping
 from workers.settings import Settings, software_version
 

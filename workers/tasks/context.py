@@ -11,7 +11,7 @@ from psfcore.fits.blocks import FitsLimits
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
 from workers.catalogue.tables import ProductRow, PsfRow, ReportRow
-from workers.contract.phases import JobError
+from workers.contract.jobs import JobError
 from workers.files.collection import intact
 from workers.files.store import Store
 from workers.settings import Settings

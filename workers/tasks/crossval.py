@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from psfcore.errors import module_of_extra
+from psfcore.psf import CURVE_RADII_PX
 from psfcore.scatter.reconstruction import Solution
 from psfcore.scatter.shapes import shape_named
-from psfcore.scatter.total_psf import CURVE_RADII_PX
 from psfcore.scatter.validation.cross_validation import (
     NEAR_CENTRE_PX,
     PARTING_SIGMAS,
@@ -35,7 +35,7 @@ from workers.tasks.results import Finished, keep_report, provenance_of, report_m
 from workers.tasks.transits import load_transit, solved
 
 if TYPE_CHECKING:
-    from workers.catalogue.parts import Part
+    from workers.catalogue.jobs import Part
     from workers.tasks.context import Context
 
 _PLOT = "psfcore.scatter.plots"

@@ -26,8 +26,7 @@ from workers.catalogue.tables import ImageRow, ProductRow, PsfRow
 from workers.contract.identities import product_identity
 from workers.contract.requests import ResolvedDeconvolve, options_of
 from workers.files.archive import safe_name
-from workers.intake.compatibility import of_upload
-from workers.intake.deprecated import CODE, deprecated_warning
+from workers.intake.compatibility import DEPRECATED_CODE, deprecated_warning, of_upload
 from workers.rows import row_of
 from workers.settings import library_versions, software_version
 from workers.tasks.context import Context
@@ -148,7 +147,7 @@ def _warnings(
     # A rerun repeats an earlier deconvolution, even if it was made by a version that did not compare channels.
     allowed = request.other_channel or context.anew
     warning = deprecated_warning(context.catalogue, row)
-    deprecated = {} if warning is None else {CODE: warning}
+    deprecated = {} if warning is None else {DEPRECATED_CODE: warning}
     return deprecated | input_warnings(psf, image, request.method.name, other_channel=allowed)
 
 

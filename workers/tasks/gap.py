@@ -19,13 +19,20 @@ from psfcore.gap.effect_sources import library_sha256
 from psfcore.gap.library.registry import Added, added_effects, library_with
 from psfcore.gap.report.report import gap_report
 from psfcore.psf import Psf
-from psfcore.scatter.inversion import Inverter, Progress
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW
 from psfcore.transit.transit import Transit
 from workers.contract.identities import corrected_psf_identity, diffraction_identity, gap_identity
 from workers.contract.requests import ResolvedGapDiagnose
-from workers.tasks.results import Finished, given_psf, keep_psf, keep_report, provenance_of, report_made
-from workers.tasks.transits import load_transit, solver
+from workers.tasks.results import (
+    Finished,
+    Means,
+    given_psf,
+    keep_psf,
+    keep_report,
+    provenance_of,
+    report_made,
+)
+from workers.tasks.transits import load_transit, means_of
 
 if TYPE_CHECKING:
     from workers.tasks.context import Context
@@ -42,16 +49,7 @@ def gap_diagnose(context: Context, parameters: Mapping[str, Any]) -> str:
     added = _added(context, request)
     parent = given_psf(context, request.psf_id)
     transit, _ = load_transit(context, request)
-    report, corrected = diagnosis_of(
-        request,
-        transit,
-        parent,
-        added,
-        job_id=context.job_id,
-        threads=context.settings.threads,
-        progress=context.report,
-        solution=solver(context, request),
-    )
+    report, corrected = diagnosis_of(request, transit, parent, added, means_of(context, request))
     if corrected is not None:
         parents = corrected.provenance["parents"]
         keep_psf(
@@ -75,15 +73,11 @@ def diagnosis_of(
     transit: Transit,
     parent: Psf | None,
     added: tuple[Added, ...],
-    *,
-    job_id: str,
-    threads: int,
-    progress: Progress,
-    solution: Inverter | None = None,
+    means: Means,
 ) -> tuple[Finished, Psf | None]:
     """Diagnose a transit as a request says: the report, and the corrected PSF if it was asked for and effects were found.
 
-    parent: the PSF with which the fit starts. added: effects that are added to the library. solution: see `diagnose`.
+    parent: the PSF with which the fit starts. added: effects that are added to the library.
     """
     shape, start = (SOFTENED_POWER_LAW, None) if parent is None else start_of(parent)
     found = diagnose(
@@ -93,11 +87,11 @@ def diagnosis_of(
         start=start,
         seed=request.seed,
         coverage=request.coverage,
-        threads=threads,
-        progress=progress,
-        solution=solution,
+        threads=means.threads,
+        progress=means.progress,
+        solution=means.solution,
     )
-    provenance = _provenance(request, parent, added, job_id)
+    provenance = _provenance(request, parent, added, means.job_id)
     corrected = None
     if request.correct and found.correctable:
         try:

@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 
 from psfcore.fits.psfs import read_psf
-from psfcore.psf import Psf, cumulative_curve
+from psfcore.psf import CURVE_RADII_PX, Psf, cumulative_curve
 from psfcore.scatter.interpolation import Epoch, curve_sigma, interpolated_psf, parameters_of
-from psfcore.scatter.total_psf import CURVE_RADII_PX
 from workers.catalogue.tables import PsfRow
 from workers.contract.identities import interpolated_psf_identity
 from workers.contract.requests import PsfInterpolate

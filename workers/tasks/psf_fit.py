@@ -9,15 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 from psfcore.errors import module_of_extra
 from psfcore.psf import Psf
-from psfcore.scatter.fit import TransitFit, fit_transit, fitted_psf
-from psfcore.scatter.inversion import Inverter, Progress
-from psfcore.scatter.report import fit_json
+from psfcore.scatter.fit import TransitFit, fit_json, fit_transit, fitted_psf
 from psfcore.transit.prepare import Prepared
 from psfcore.transit.transit import Transit
 from workers.contract.identities import diffraction_identity, psf_fit_identity
 from workers.contract.requests import ResolvedPsfFit
-from workers.tasks.results import keep_psf, provenance_of, write_json
-from workers.tasks.transits import load_transit, solver
+from workers.tasks.results import Means, keep_psf, provenance_of, write_json
+from workers.tasks.transits import load_transit, means_of
 
 if TYPE_CHECKING:
     from workers.tasks.context import Context
@@ -52,44 +50,27 @@ def psf_fit(context: Context, parameters: Mapping[str, Any]) -> str:
     if context.made(PsfRow, identity) is not None:
         return identity
     transit, prepared = load_transit(context, request)
-    fitted = fit(
-        request,
-        transit,
-        prepared,
-        job_id=context.job_id,
-        threads=context.settings.threads,
-        progress=context.report,
-        solution=solver(context, request),
-    )
+    fitted = fit(request, transit, prepared, means_of(context, request))
     _save(context, request, identity, fitted)
     return identity
 
 
-def fit(
-    request: ResolvedPsfFit,
-    transit: Transit,
-    prepared: Prepared,
-    *,
-    job_id: str,
-    threads: int,
-    progress: Progress,
-    solution: Inverter | None = None,
-) -> Fitted:
-    """Fit a transit as a request says. solution: see `fit_transit`."""
+def fit(request: ResolvedPsfFit, transit: Transit, prepared: Prepared, means: Means) -> Fitted:
+    """Fit a transit as a request says."""
     found = fit_transit(
         transit,
         shape=request.shape,
         as_published=request.as_published,
         seed=request.seed,
-        threads=threads,
-        progress=progress,
-        solution=solution,
+        threads=means.threads,
+        progress=means.progress,
+        solution=means.solution,
     )
     identity = psf_fit_identity(request)
     provenance = {
         "psf_id": identity,
         "inputs_sha256": transit.sha256,
-        **provenance_of(job_id, request),
+        **provenance_of(means.job_id, request),
     }
     name = f"{transit.instrument or 'transit'}-fitted"
     psf = fitted_psf(found, name=name, version=f"0.1.0+{identity[:8]}", provenance=provenance)

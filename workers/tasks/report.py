@@ -11,13 +11,12 @@ from psfcore.errors import module_of_extra
 from psfcore.evaluation.shapes import compare_shapes_by_errors
 from psfcore.psf import Psf
 from psfcore.report.report import make_report, report_json
-from psfcore.scatter.inversion import Inverter, Progress
 from psfcore.transit.prepare import Prepared
 from psfcore.transit.transit import Kernel, Transit
 from workers.contract.identities import report_identity
 from workers.contract.requests import ResolvedReport
-from workers.tasks.results import Finished, given_psf, keep_report, provenance_of, report_made
-from workers.tasks.transits import load_transit, solver
+from workers.tasks.results import Finished, Means, given_psf, keep_report, provenance_of, report_made
+from workers.tasks.transits import load_transit, means_of
 
 if TYPE_CHECKING:
     from workers.tasks.context import Context
@@ -34,16 +33,7 @@ def report(context: Context, parameters: Mapping[str, Any]) -> str:
         return identity
     psf = given_psf(context, request.psf_id)
     transit, prepared = load_transit(context, request, diffraction=None if psf is None else point())
-    finished = make(
-        request,
-        transit,
-        prepared,
-        psf,
-        job_id=context.job_id,
-        threads=context.settings.threads,
-        progress=context.report,
-        solution=solver(context, request),
-    )
+    finished = make(request, transit, prepared, psf, means_of(context, request))
     keep_report(context, identity, KIND, finished, transit_id=request.transit_id)
     return identity
 
@@ -59,34 +49,26 @@ def point() -> Kernel:
 
 
 def make(
-    request: ResolvedReport,
-    transit: Transit,
-    prepared: Prepared,
-    psf: Psf | None,
-    *,
-    job_id: str,
-    threads: int,
-    progress: Progress,
-    solution: Inverter | None = None,
+    request: ResolvedReport, transit: Transit, prepared: Prepared, psf: Psf | None, means: Means
 ) -> Finished:
-    """Make the report that a request describes. psf: the PSF to test; None: fit one. solution: see `make_report`."""
+    """Make the report that a request describes. psf: the PSF to test; None: fit one."""
     report = make_report(
         transit,
         prepared,
         psf=psf,
         dark_offsets=request.dark_offsets,
         seed=request.seed,
-        threads=threads,
-        progress=progress,
-        solution=solution,
+        threads=means.threads,
+        progress=means.progress,
+        solution=means.solution,
     )
-    provenance = {"report_id": report_identity(request), **provenance_of(job_id, request)}
+    provenance = {"report_id": report_identity(request), **provenance_of(means.job_id, request)}
     said = report_json(report, provenance)
     if request.shapes:
         assert (
             report.fit is not None
         )  # a request that compares shapes names no PSF, so the transit was fitted
-        shapes = compare_shapes_by_errors(report.fit.solution, seed=request.seed, progress=progress)
+        shapes = compare_shapes_by_errors(report.fit.solution, seed=request.seed, progress=means.progress)
         said["shapes"] = shapes.to_json()
     return Finished(
         said,

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.comparison import Comparison, compare
+from psfcore.arrays import Comparison, compare
 from psfcore.errors import DataError
 from psfcore.fits.images import read_plane, read_planes
 from psfcore.fits.psfs import read_psf

@@ -17,6 +17,7 @@ from workers.settings import library_versions, software_version
 from workers.versions import TOTAL, PsfStatus, channel_of, series_of
 
 if TYPE_CHECKING:
+    from psfcore.scatter.inversion import Inverter, Progress
     from workers.catalogue.tables import PsfRow
     from workers.files.store import Store
     from workers.tasks.context import Context
@@ -108,6 +109,17 @@ def keep_tables(psf: Psf, store: Store, threads: int) -> str:
 
 
 # Reports --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Means:
+    """How a result is computed. job_id: the job that its provenance names. solution: gives the solution of the transit, see
+    `psfcore.scatter.inversion.Inverter`; None: it is computed."""
+
+    job_id: str
+    threads: int
+    progress: Progress
+    solution: Inverter | None = None
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from psfcore.errors import DataError
 from psfcore.fits.psfs import read_psf
-from psfcore.scatter.inversion import ALGORITHM_VERSION, Inverter, invert
+from psfcore.scatter.inversion import ALGORITHM_VERSION, invert
 from psfcore.scatter.kept import read_solution, write_solution
 from psfcore.scatter.reconstruction import Progress, Solution
 from psfcore.scatter.shapes import Shape, Vector
@@ -28,6 +28,7 @@ from workers.contract.identities import canonical_hash, diffraction_identity
 from workers.contract.requests import ResolvedOnTransit
 from workers.rows import row_of
 from workers.settings import library_versions, software_version
+from workers.tasks.results import Means
 
 if TYPE_CHECKING:
     from workers.tasks.context import Context
@@ -88,8 +89,8 @@ def _built_diffraction(
 # Solutions ------------------------------------------------------------------------------------------
 
 
-def solver(context: Context, request: ResolvedOnTransit) -> Inverter:
-    """``solved`` for one request, as a function that psfcore calls when it needs the solution."""
+def means_of(context: Context, request: ResolvedOnTransit) -> Means:
+    """The means of a job on a transit. psfcore calls ``solved`` when it needs the solution."""
 
     def solve(
         transit: Transit, shape: Shape, /, *, start: Vector | None, threads: int, progress: Progress
@@ -97,7 +98,7 @@ def solver(context: Context, request: ResolvedOnTransit) -> Inverter:
         assert threads == context.settings.threads
         return solved(context, request, transit, shape, start=start, progress=progress)
 
-    return solve
+    return Means(context.job_id, context.settings.threads, context.report, solve)
 
 
 def solved(

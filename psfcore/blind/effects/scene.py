@@ -21,8 +21,8 @@ from psfcore.blind.effects.effect import (
     unit_coordinates,
 )
 from psfcore.blind.effects.fine_optics import FINE
-from psfcore.simulate.disc import Behind, covered_share
 from psfcore.simulate.plan import HIGH, Plan
+from psfcore.simulate.sky import Behind, covered_share
 from psfcore.transit.transit import Place
 
 Plane = NDArray[np.float64]

@@ -27,7 +27,7 @@ from psfcore.blind.effects.effect import (
 )
 from psfcore.blind.effects.fine_optics import FINE, FineOptics, turned_offsets
 from psfcore.blind.effects.optics import rescaled
-from psfcore.simulate.disc import Behind
+from psfcore.simulate.sky import Behind
 
 Plane = NDArray[np.float64]
 

@@ -26,8 +26,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.scatter.optics import Optics, Pixels, put
 from psfcore.scatter.reconstruction import Solution
+from psfcore.scatter.total_psf import Optics, Pixels, put
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]

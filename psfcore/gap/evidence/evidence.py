@@ -32,8 +32,8 @@ from psfcore.gap.evidence.unocculted_blocks import (
     unocculted_blocks,
 )
 from psfcore.gap.view import View
-from psfcore.scatter.optics import Blur
 from psfcore.scatter.reconstruction import Progress, Solution
+from psfcore.scatter.total_psf import Blur
 from psfcore.transit.occulter import UNDESCRIBED, FoundPlace
 from psfcore.transit.transit import Frame
 

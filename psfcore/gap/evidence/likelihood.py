@@ -46,11 +46,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr, logsumexp
 
+from psfcore.arrays import scaled_inverse
 from psfcore.gap.evidence.evidence import Prior
 from psfcore.gap.evidence.linear_model import WEAKEST, LinearModel
 from psfcore.gap.evidence.one_sided import log_odds_above_zero, log_odds_at_zero, log_of_any_number
 from psfcore.gap.evidence.unocculted_blocks import LEAST_IMAGES
-from psfcore.least_squares import scaled_inverse
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]

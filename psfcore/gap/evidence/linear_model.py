@@ -34,9 +34,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.arrays import scaled_inverse
 from psfcore.gap.evidence.cells import DiscCells, whitening
 from psfcore.gap.evidence.evidence import Evidence
-from psfcore.least_squares import scaled_inverse
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]

@@ -42,7 +42,7 @@ from psfcore.gap.evidence.linear_model import FLOOR
 from psfcore.gap.evidence.unocculted_blocks import block_means
 from psfcore.gap.view import Field, View
 from psfcore.psf import crop_or_pad
-from psfcore.scatter.optics import Optics
+from psfcore.scatter.total_psf import Optics
 
 Plane = NDArray[np.float64]
 Vector = NDArray[np.float64]

@@ -16,9 +16,8 @@ from psfcore.gap.effect import EffectParameter as Parameter
 from psfcore.gap.evidence.search import KERNEL_REACH_PX, displaced, distinguished, place_search
 from psfcore.gap.view import Field, View
 from psfcore.psf import crop_or_pad
-from psfcore.scatter.optics import Blur
 from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW
-from psfcore.scatter.total_psf import TotalPsf
+from psfcore.scatter.total_psf import Blur, TotalPsf
 
 Kernel = NDArray[np.float64]
 Steps = tuple[tuple[int, int], ...]

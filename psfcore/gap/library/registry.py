@@ -18,11 +18,11 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from psfcore.extensions.user_code import is_file, module_in_file, named_errors
 from psfcore.gap.effect import Change, Effect
 from psfcore.gap.effect_sources import bad_effects, sha256_of_source
 from psfcore.gap.library import detector, optics, scene
 from psfcore.gap.view import Field, View
+from psfcore.user_code import is_file, module_in_file, named_errors
 
 Result = TypeVar("Result")
 

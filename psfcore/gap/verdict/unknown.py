@@ -17,11 +17,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from psfcore.arrays import scaled_inverse
 from psfcore.gap.evidence.fields import Field, FieldColumns, FieldShape
 from psfcore.gap.evidence.likelihood import Likelihood
 from psfcore.gap.evidence.linear_model import WEAKEST, LinearModel
 from psfcore.gap.verdict.posterior import Form, Names, Posterior
-from psfcore.least_squares import scaled_inverse
 
 LIKELY_FIELD = 0.05  # fields with a smaller probability are not listed
 MOST_FIELDS = 4

@@ -46,8 +46,8 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter
 from scipy.special import ndtr
 
+from psfcore.arrays import json_attributes, json_values
 from psfcore.errors import DataError
-from psfcore.json_values import json_attributes, json_values
 from psfcore.psf import cumulative_curve
 from psfcore.scatter.inversion import refit
 from psfcore.scatter.reconstruction import Progress, Solution

@@ -45,11 +45,10 @@ from scipy.optimize import lsq_linear
 
 from psfcore.convolution.convolver import Convolver
 from psfcore.psf import REACH_GRID_PX
-from psfcore.scatter.optics import Blur, pick
 from psfcore.scatter.reconstruction import Progress, Reconstruction
 from psfcore.scatter.segments import Segments, segment_sums, shells_as_published
 from psfcore.scatter.shapes import Shape, Vector
-from psfcore.scatter.total_psf import Kernel
+from psfcore.scatter.total_psf import Blur, Kernel, pick
 
 Matrix = NDArray[np.float64]
 

@@ -31,7 +31,7 @@ from service.cli.options import (
 )
 from service.cli.progress import echo
 from service.client.outputs import written
-from workers.cache_folder import psf_cache, published_folder
+from workers.machine import psf_cache, published_folder
 
 if TYPE_CHECKING:
     from psfcore.psf import Psf

@@ -22,10 +22,10 @@ from psfcore.blind.effects.registry import EFFECTS, KNOWN, UNKNOWN, WITHHELD, ef
 from psfcore.blind.leftover import LinearEstimator
 from psfcore.errors import DataError
 from psfcore.gap.library.registry import LIBRARY
-from psfcore.simulate.disc import binned
 from psfcore.simulate.plan import COMBINED, HIGH, Plan, default_plan
 from psfcore.simulate.scatter_truth import ScatterTruth, anisotropic_kernel
 from psfcore.simulate.scene import drawn_scene
+from psfcore.simulate.sky import binned
 from psfcore.transit.transit import Frame
 
 LAW = ScatterTruth(5.0, 2.5, 0.4)

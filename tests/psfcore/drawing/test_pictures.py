@@ -27,7 +27,7 @@ from psfcore.drawing.thumbnail import (
     rgb,
     write_thumbnail,
 )
-from psfcore.drawing.units import rate_label, unit_label
+from psfcore.fits.units import rate_label, unit_label
 from psfcore.image import Image
 from tests.psfcore.conftest import gaussian, make_psf
 

@@ -11,7 +11,7 @@ from scipy.sparse.linalg import LinearOperator, gmres
 
 from psfcore.convolution.convolver import Convolver
 from psfcore.evaluation.evaluation import Evaluation, FrameEvaluation, evaluate
-from psfcore.scatter.validation.dark_offsets import DarkOffsetStudy, dark_offset_study
+from psfcore.scatter.validation.robustness import DarkOffsetStudy, dark_offset_study
 from psfcore.simulate.scatter_truth import total_kernel
 from psfcore.transit.transit import Kernel
 from tests.psfcore.small_transits import DIFFRACTION, SCATTER, SIZE_PX, noise_free, observed, sky, solved

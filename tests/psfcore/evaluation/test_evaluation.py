@@ -13,8 +13,8 @@ from psfcore.evaluation.evaluation import Superposed, evaluate, half_width_px, s
 from psfcore.evaluation.report import report
 from psfcore.evaluation.summary_lines import summary_lines
 from psfcore.noise import Noise
-from psfcore.scatter.optics import Optics, noise_covariance, pick, put
 from psfcore.scatter.reconstruction import LEAST_DARK_PIXELS
+from psfcore.scatter.total_psf import Optics, noise_covariance, pick, put
 from psfcore.transit.occulter import disc_distance, fully_dark
 from psfcore.transit.transit import Frame, Place
 from tests.psfcore.evaluation.small_evaluations import (

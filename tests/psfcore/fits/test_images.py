@@ -14,14 +14,14 @@ from astropy.io import fits
 from astropy.wcs import WCS
 from numpy.typing import NDArray
 
-from psfcore.deconvolve.assess.quality import MEANINGS, QualityBit
+from psfcore.deconvolve.assess.changes import MEANINGS, QualityBit
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.header import read_summary
 from psfcore.fits.images import described, read_mask_image, read_planes, write_image
 from psfcore.fits.observation import read_observation
 from psfcore.image import Image, MaskBit, Saturation
-from psfcore.simulate.observe import demo_image
+from psfcore.simulate.scene import demo_image
 from tests.psfcore.conftest import gaussian, make_psf
 from tests.psfcore.fits.raw_files import block, image_cards
 

@@ -13,8 +13,7 @@ from scipy.stats import poisson
 
 from psfcore.fits import observation
 from psfcore.fits.blocks import FitsLimits
-from psfcore.fits.observation import read_observation
-from psfcore.fits.saturation import largest_value, with_saturation
+from psfcore.fits.observation import largest_value, read_observation, with_saturation
 from psfcore.image import Image, MaskBit
 from psfcore.instruments.model import Instrument, parse_instrument
 from tests.conftest import SMALL_INSTRUMENT, write_image

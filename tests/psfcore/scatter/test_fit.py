@@ -17,10 +17,18 @@ from psfcore.fits.psfs import read_psf, write_psf
 from psfcore.psf import REACH_GRID_PX, cumulative_curve
 from psfcore.scatter import fit as fit_module
 from psfcore.scatter.as_published import AS_PUBLISHED, CORRECTED_ALONE, Choices, Published
-from psfcore.scatter.fit import ALONE_SUBSETS, RADII_PX, TransitFit, fit_transit, fitted_psf, overdispersion
+from psfcore.scatter.fit import (
+    ALONE_SUBSETS,
+    RADII_PX,
+    TransitFit,
+    fit_json,
+    fit_sentence,
+    fit_transit,
+    fitted_psf,
+    overdispersion,
+)
 from psfcore.scatter.plots import fit_png
 from psfcore.scatter.reconstruction import Inversion, Solution
-from psfcore.scatter.report import fit_json, fit_sentence
 from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW
 from psfcore.transit.transit import Transit
 from tests.psfcore.conftest import LIMITS

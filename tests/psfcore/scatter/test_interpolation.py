@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from psfcore.errors import DataError
 from psfcore.fits.psfs import read_psf, write_psf
-from psfcore.psf import FittedShape, Psf, crop_or_pad, cumulative_curve
+from psfcore.psf import CURVE_RADII_PX, FittedShape, Psf, crop_or_pad, cumulative_curve
 from psfcore.scatter.interpolation import (
     Epoch,
     curve_sigma,
@@ -27,7 +27,7 @@ from psfcore.scatter.interpolation import (
 )
 from psfcore.scatter.inversion import invert
 from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW
-from psfcore.scatter.total_psf import CURVE_RADII_PX, possible_psfs
+from psfcore.scatter.total_psf import possible_psfs
 from psfcore.simulate.scatter_truth import ScatterTruth, total_kernel
 from tests.psfcore.conftest import LIMITS
 from tests.psfcore.small_transits import DIFFRACTION, observed, sky, solved

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from psfcore.errors import DataError
 from psfcore.noise import Noise
 from psfcore.scatter.inversion import PILOT_FRAMES, invert
-from psfcore.scatter.optics import Blur, Optics, pick, put
 from psfcore.scatter.reconstruction import LEAST_DARK_PIXELS, Inversion, Solution, dark_pixels
 from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW, stretch_of
+from psfcore.scatter.total_psf import Blur, Optics, pick, put
 from psfcore.simulate.bound import bound_of_sky
 from psfcore.simulate.scatter_truth import ScatterTruth
 from psfcore.simulate.sky import true_sky

@@ -9,11 +9,10 @@ import pytest
 from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import Convolver, linear_convolve
-from psfcore.psf import REACH_GRID_PX, cumulative_curve
-from psfcore.scatter.optics import Blur, Optics, pick, put
+from psfcore.psf import CURVE_RADII_PX, REACH_GRID_PX, cumulative_curve
 from psfcore.scatter.power_law import scatter_kernel
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW
-from psfcore.scatter.total_psf import CURVE_RADII_PX, TotalPsf
+from psfcore.scatter.total_psf import Blur, Optics, TotalPsf, pick, put
 from psfcore.simulate.scatter_truth import ScatterTruth, total_kernel
 from tests.psfcore.small_transits import DIFFRACTION, SCATTER
 

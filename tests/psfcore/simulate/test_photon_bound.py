@@ -18,7 +18,6 @@ from psfcore.simulate import bound as bound_module
 from psfcore.simulate import scatter_truth
 from psfcore.simulate import sky as sky_module
 from psfcore.simulate.bound import PhotonBound, bound_of_sky
-from psfcore.simulate.disc import fully_dark
 from psfcore.simulate.plan import Plan, default_plan
 from psfcore.simulate.scatter_truth import (
     ScatterTruth,
@@ -28,7 +27,7 @@ from psfcore.simulate.scatter_truth import (
     total_kernel,
 )
 from psfcore.simulate.scene import drawn_scene
-from psfcore.simulate.sky import TrueSky, true_sky
+from psfcore.simulate.sky import TrueSky, fully_dark, true_sky
 from psfcore.simulate.transit import read_sky, simulate, write
 from tests.psfcore.conftest import gaussian
 

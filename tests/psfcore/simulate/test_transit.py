@@ -20,12 +20,10 @@ from psfcore.fits.observation import read_observation
 from psfcore.instruments.model import load_instrument
 from psfcore.noise import Noise
 from psfcore.scatter.power_law import scatter_kernel
-from psfcore.simulate.disc import covered_share, fully_dark
-from psfcore.simulate.observe import observe
 from psfcore.simulate.plan import COMBINED, HIGH, Plan, default_plan
 from psfcore.simulate.scatter_truth import ScatterTruth, anisotropic_kernel, total_kernel
-from psfcore.simulate.scene import drawn_scene, scene_from_image, solar_scene
-from psfcore.simulate.sky import TrueSky, true_sky
+from psfcore.simulate.scene import drawn_scene, observe, scene_from_image, solar_scene
+from psfcore.simulate.sky import TrueSky, covered_share, fully_dark, true_sky
 from psfcore.simulate.transit import (
     HRI_EUV,
     SimulatedTransit,

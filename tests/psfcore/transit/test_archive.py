@@ -22,6 +22,7 @@ import pytest
 from astropy.io import fits
 
 from psfcore.errors import DataError
+from psfcore.files import sha256_of
 from psfcore.transit import admission
 from psfcore.transit.archive import (
     START_BYTES,
@@ -33,7 +34,6 @@ from psfcore.transit.archive import (
     transit_in,
     unpack,
 )
-from psfcore.whole_files import sha256_of
 from tests.fits_bombs import gzip_named
 from tests.transit_files import write_transit
 

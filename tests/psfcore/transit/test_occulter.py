@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from psfcore.errors import DataError
 from psfcore.noise import Noise
-from psfcore.simulate.disc import covered_share
 from psfcore.simulate.plan import Shot, default_plan
-from psfcore.simulate.sky import TrueSky, true_sky
+from psfcore.simulate.sky import TrueSky, covered_share, true_sky
 from psfcore.transit import occulter
 from psfcore.transit.occulter import (
     LEAST_NEIGHBOURS,

@@ -17,6 +17,7 @@ from fastapi.testclient import TestClient
 
 import heliopsf
 from psfcore.errors import DataError
+from psfcore.files import sha256_of
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.psfs import read_psf
 from psfcore.fits.psfs import write_psf as write_built
@@ -24,12 +25,11 @@ from psfcore.fits.stored_psf import cutout
 from psfcore.instruments import files
 from psfcore.psf_sampling import rebinned
 from psfcore.transit.archive import pack
-from psfcore.whole_files import sha256_of
 from service.cli.local import Local, local
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
 from tests.service.conftest import upload
 from tests.transit_files import write_transit
-from workers.cache_folder import psf_cache
+from workers.machine import psf_cache
 
 
 def test_files_are_read_in_place_and_only_as_they_were(tmp_path: Path) -> None:

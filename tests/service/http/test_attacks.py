@@ -19,7 +19,7 @@ from tests.fits_bombs import lying_tiles
 from tests.service.conftest import refusal, settings_in, upload
 from tests.service.http.attacks import ARCHIVES, FILES, MIB, REQUESTS, Attack
 from tests.service.keyed import Keyed, keyed
-from workers.contract.phases import Phase
+from workers.contract.jobs import Phase
 from workers.files.store import Store
 from workers.run.runner import Runner, load_tasks
 

@@ -12,7 +12,7 @@ from tests.service.keyed import Keyed
 from tests.service.vo.made import add_product
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, ProductRow
-from workers.contract.phases import Phase
+from workers.contract.jobs import Phase
 
 SAME = "0123456789"  # the first digits of several ids
 

@@ -14,7 +14,7 @@ from sqlalchemy import insert
 from tests.conftest import write_image, write_psf
 from tests.service.conftest import execute, upload
 from workers.catalogue.tables import JobRow, ProductRow
-from workers.contract.phases import Phase
+from workers.contract.jobs import Phase
 
 SHAPE = (96, 128)
 # Helioprojective coordinates with different scales and a rotation, so that a swap of axes or signs is noticed.

@@ -14,8 +14,8 @@ from pydantic_xml import BaseXmlModel, element
 from vo_models.uws import Jobs, JobSummary, Parameter, Results
 from vo_models.uws.types import ExecutionPhase
 
+from psfcore.files import sha256_of
 from psfcore.transit.archive import pack
-from psfcore.whole_files import sha256_of
 from tests.service.conftest import upload
 from tests.service.keyed import keyed
 from tests.service.vo.made import add_product

@@ -27,7 +27,7 @@ from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
 from workers.catalogue.tables import BulkItemRow, BulkRow, ImageRow
 from workers.contract.bulk import DELETABLE, BulkPhase, ItemState
-from workers.contract.phases import Fault, JobError
+from workers.contract.jobs import Fault, JobError
 from workers.files.store import Store
 from workers.intake.estimates import BULK, factor
 from workers.settings import Settings

@@ -17,7 +17,7 @@ from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.database import Database
 from workers.catalogue.jobs import Lease
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow, ProductRow
-from workers.contract.phases import Fault, JobError, Phase
+from workers.contract.jobs import Fault, JobError, Phase
 
 BROKEN = JobError(fault=Fault.INTERNAL, code="broken", message="broken")
 

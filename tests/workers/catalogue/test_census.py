@@ -20,7 +20,7 @@ from tests.workers.psf_examples import psf
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.census import FileTally
 from workers.catalogue.tables import DEFAULT_OWNER, ImageRow, JobRow
-from workers.contract.phases import Phase
+from workers.contract.jobs import Phase
 from workers.files.store import Store
 from workers.run.runner import Runner
 from workers.settings import Settings

@@ -13,7 +13,7 @@ from tests.workers.databases import BOTH, change
 from tests.workers.jobs import claimed, job_row
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow
-from workers.contract.phases import Phase
+from workers.contract.jobs import Phase
 
 
 def drafted(catalogue: Catalogue, **terms: Any) -> JobRow:

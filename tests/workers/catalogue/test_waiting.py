@@ -15,8 +15,7 @@ from workers.catalogue import waiting
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
 from workers.catalogue.tables import JobRow
-from workers.contract.phases import Phase
-from workers.contract.queues import Queue
+from workers.contract.jobs import Phase, Queue
 from workers.files.store import Store
 from workers.run.child import Stopping
 from workers.run.runner import Runner

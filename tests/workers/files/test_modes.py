@@ -1,15 +1,16 @@
-"""The data folder is closed to other users; output folders follow the operator's umask."""
+"""The data folder is closed to other users, output folders follow the operator's umask, and links lead out of no allowed folder."""
 
 from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
-from workers.files import modes
+from psfcore.errors import DataError
+from workers.files import archive, modes
 
 
 def mode(path: Path) -> int:
@@ -79,3 +80,91 @@ def test_the_data_folder_of_another_user_is_told(
     monkeypatch.setattr(os, "geteuid", lambda: tmp_path.stat().st_uid + 1)
     modes.private_folder(tmp_path)
     assert mode(tmp_path) == 0o755 and "chmod 700" in caplog.text
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """An allowed folder with the file ``sub/image``, and beside it a folder with the file ``secret/image``."""
+    for folder, text in (("root/sub", "open"), ("secret", "secret")):
+        (tmp_path / folder).mkdir(parents=True)
+        (tmp_path / folder / "image").write_text(text)
+    return (tmp_path / "root").resolve()
+
+
+@pytest.fixture
+def swapped(root: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], None]:
+    """A function that lets a path be replaced by a link out of the allowed folder directly after each check."""
+
+    checked = archive.check_under
+
+    def swap(part: Path) -> None:
+        def check(path: Path, *arguments: object) -> Path:
+            found = checked(path, *arguments)  # type: ignore[arg-type]
+            if not part.is_symlink():
+                target = root.parent / "secret" / ("image" if part.name == "image" else "")
+                part.rename(root.parent / "moved")
+                part.symlink_to(target)
+            return found
+
+        monkeypatch.setattr(archive, "check_under", check)
+
+    return swap
+
+
+def test_a_file_is_read_and_links_inside_are_followed(root: Path) -> None:
+    (root / "link").symlink_to(root / "sub")
+    for path in (root / "sub" / "image", root / "link" / "image"):
+        with archive.opened(path, [root]) as file:
+            assert archive.reopened(file).read_text() == "open" and file.read() == b"open"
+
+
+@pytest.mark.parametrize("part", ["sub", "sub/image"])
+def test_a_part_that_becomes_a_link_after_the_check_is_not_followed(
+    root: Path, swapped: Callable[[Path], None], part: str
+) -> None:
+    swapped(root / part)
+    with pytest.raises((OSError, DataError)), archive.opened(root / "sub" / "image", [root]):
+        pass
+
+
+def test_nothing_is_written_through_a_folder_that_becomes_a_link(
+    root: Path, swapped: Callable[[Path], None]
+) -> None:
+    (root.parent / "source").write_text("product")
+    swapped(root / "sub")
+    with pytest.raises((OSError, DataError)):
+        archive.put(root.parent / "source", root / "sub" / "product", [root])
+    assert [path.name for path in (root.parent / "secret").iterdir()] == ["image"]
+
+
+def test_a_link_in_place_of_the_product_is_replaced_and_not_followed(root: Path) -> None:
+    (root.parent / "source").write_text("product")
+    (root / "product").symlink_to(root.parent / "secret" / "image")
+    archive.put(root.parent / "source", root / "product", [root])
+    assert (root / "product").read_text() == "product" and not (root / "product").is_symlink()
+    assert (root.parent / "secret" / "image").read_text() == "secret"
+
+
+def test_a_product_is_written_into_new_folders_and_leaves_no_partial_file(root: Path) -> None:
+    (root.parent / "source").write_text("product")
+    archive.make_folder(root / "a" / "b", [root])
+    archive.put(root.parent / "source", root / "a" / "b" / "c" / "product", [root])
+    assert [path.name for path in (root / "a" / "b" / "c").iterdir()] == ["product"]
+    partial = root / "a" / "b" / "c" / ".product.0123.part"
+    for path in (partial, partial.with_name(".other.0123.part")):
+        path.touch()
+    archive.remove_partials(root / "a" / "b" / "c" / "product", [root])
+    assert sorted(path.name for path in partial.parent.iterdir()) == [".other.0123.part", "product"]
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir])
+def test_what_is_no_regular_file_is_refused_at_once(root: Path, make: Callable[[Path], None]) -> None:
+    make(root / "odd")
+    with pytest.raises(DataError, match="regular file"), archive.opened(root / "odd", [root]):
+        pass
+
+
+def test_a_path_outside_is_refused(root: Path) -> None:
+    with pytest.raises(DataError) as refused, archive.opened(root.parent / "secret" / "image", [root]):
+        pass
+    assert refused.value.code == "path-not-allowed"

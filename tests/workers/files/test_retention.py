@@ -15,7 +15,7 @@ from tests.workers.jobs import bulk_row
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ImageRow, JobRow, ReportRow
 from workers.contract.bulk import BulkPhase
-from workers.contract.phases import Phase
+from workers.contract.jobs import Phase
 from workers.files.collection import DAY_S, retain
 from workers.files.store import Store
 from workers.settings import Settings

@@ -14,7 +14,7 @@ from tests.workers.jobs import claimed, job_row
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow, PartRow, WorkerRow
-from workers.contract.phases import Phase
+from workers.contract.jobs import Phase
 
 pytestmark = BOTH
 OFF_S = (600.0, -600.0)

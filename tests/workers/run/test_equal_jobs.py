@@ -20,7 +20,7 @@ from workers.broker.reconciler import reconcile
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow, PsfRow
-from workers.contract.phases import Fault, JobError, Phase
+from workers.contract.jobs import Fault, JobError, Phase
 from workers.files.store import Store
 from workers.run.runner import Runner
 from workers.settings import Settings

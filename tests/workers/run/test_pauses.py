@@ -14,8 +14,7 @@ from tests.workers.conftest import Clock
 from tests.workers.jobs import claimed, job_row
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import JobRow
-from workers.contract.phases import Phase
-from workers.contract.queues import Queue
+from workers.contract.jobs import Phase, Queue
 from workers.files.store import Store
 from workers.run import attempt
 from workers.run.attempt import Attempt

@@ -28,7 +28,7 @@ from workers.broker import app as queue
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow
-from workers.contract.phases import Phase
+from workers.contract.jobs import Phase
 from workers.files.store import Store
 from workers.run.attempt import Attempt
 from workers.run.child import Stopping

@@ -16,9 +16,9 @@ from tests.transit_files import write_transit
 from tests.workers.databases import change
 from tests.workers.jobs import job_row
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.parts import Part, Parts
+from workers.catalogue.jobs import Part, Parts
 from workers.catalogue.tables import JobRow, PartRow
-from workers.contract.phases import Phase
+from workers.contract.jobs import Phase
 from workers.files.store import Store
 from workers.run.runner import Runner
 from workers.settings import Settings

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from psfcore.deconvolve import conditions, run, whole
+from psfcore.deconvolve import conditions, run, work
 from psfcore.deconvolve.methods.registry import method_names
 from psfcore.errors import DataError
 from service.client.http import ServiceError
@@ -20,7 +20,7 @@ from tests.in_process import InProcess
 from tests.workers.jobs import job_row
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, ProductRow
-from workers.contract.phases import Phase
+from workers.contract.jobs import Phase
 from workers.contract.requests import METHODS
 from workers.files.store import Store
 from workers.run import attempt
@@ -119,7 +119,7 @@ def test_a_worker_with_one_thread_draws_in_that_thread(
         monkeypatch.setattr(where, name, wrapped)
 
     noted(run, "draw_preview")
-    noted(whole, "measure_changes")
+    noted(work, "measure_changes")
     local = InProcess(settings.model_copy(update={"worker_threads": threads}))
     local.deconvolve(image_file, psf_id=local.upload_psf(psf_file)["id"])
     local.close()

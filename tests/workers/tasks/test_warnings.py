@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from psfcore.deconvolve.assess import plots as assess_plots
-from psfcore.deconvolve.assess.quality import QualityBit
+from psfcore.deconvolve.assess import pictures
+from psfcore.deconvolve.assess.changes import QualityBit
 from psfcore.drawing import plots
 from psfcore.errors import DataError
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
@@ -97,7 +97,7 @@ def test_pictures_name_the_unit_of_the_image(
     local: InProcess, psf_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     units: list[str] = []
-    for module, name in ((plots, "preview_png"), (assess_plots, "changes_png")):
+    for module, name in ((plots, "preview_png"), (pictures, "changes_png")):
         real = getattr(module, name)
 
         def noted(*arguments: Any, real: Any = real, **named: Any) -> None:

@@ -21,13 +21,12 @@ from psfcore.deconvolve.assess.artefacts import (
     ringing_pct,
 )
 from psfcore.deconvolve.assess.changes import BLOCKS_PX, block_means, measure_changes
-from psfcore.deconvolve.assess.plots import changes_png
+from psfcore.deconvolve.assess.pictures import changes_png
 from psfcore.errors import DataError
 from psfcore.image import Image
 from psfcore.noise import Noise
 from psfcore.psf import Psf, crop_centred
-from psfcore.simulate.observe import observe
-from psfcore.simulate.scene import solar_scene
+from psfcore.simulate.scene import observe, solar_scene
 from tests.psfcore.conftest import delta, make_image, make_psf
 from tests.psfcore.deconvolve.scattering import richardson_lucy, scattering_psf
 

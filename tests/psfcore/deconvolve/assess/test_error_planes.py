@@ -18,13 +18,12 @@ from psfcore.deconvolve.assess.error_planes import (
     sigma_points,
     spread_of_results,
 )
-from psfcore.deconvolve.whole import Options, Work
+from psfcore.deconvolve.work import Options, Work
 from psfcore.errors import DataError
 from psfcore.image import Image, MaskBit
 from psfcore.noise import Noise
 from psfcore.psf import Psf
-from psfcore.simulate.observe import observe
-from psfcore.simulate.scene import solar_scene
+from psfcore.simulate.scene import observe, solar_scene
 from tests.psfcore.conftest import delta, make_image, make_psf
 from tests.psfcore.deconvolve.scattering import richardson_lucy, scattering_psf
 

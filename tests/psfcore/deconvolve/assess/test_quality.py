@@ -9,10 +9,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from psfcore.deconvolve.assess.quality import NEAR_MASKED_PX, QualityBit, quality_plane
+from psfcore.deconvolve.assess.changes import NEAR_MASKED_PX, QualityBit, quality_plane
 from psfcore.image import MaskBit
 from psfcore.psf import Psf
-from psfcore.simulate.observe import observe
+from psfcore.simulate.scene import observe
 from tests.psfcore.conftest import make_image
 from tests.psfcore.deconvolve.scattering import richardson_lucy, scattering_psf
 

@@ -9,15 +9,14 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 
-from psfcore.deconvolve import memory
+from psfcore.deconvolve import extent
 from psfcore.deconvolve.conditions import Conditions, Deconvolved
 from psfcore.deconvolve.methods.linear import METHOD, Additive
 from psfcore.deconvolve.methods.registry import method_names
 from psfcore.deconvolve.problem import pose
 from psfcore.image import Image
 from psfcore.psf import Psf
-from psfcore.simulate.observe import observe
-from psfcore.simulate.scene import solar_scene
+from psfcore.simulate.scene import observe, solar_scene
 from tests.psfcore.conftest import gaussian, make_image, make_psf
 from workers.contract.requests import Method
 from workers.intake.costs import COSTS
@@ -30,8 +29,8 @@ def faults(name: str, module: Any) -> list[str]:
     """A sentence for each thing that a method lacks."""
     told = []
     for figures in ("MARGIN_SHARE", "WORKING_BYTES"):
-        if name not in getattr(memory, figures):
-            told.append(f"{name}: add its entry to {figures} of psfcore/deconvolve/memory.py")
+        if name not in getattr(extent, figures):
+            told.append(f"{name}: add its entry to {figures} of psfcore/deconvolve/extent.py")
     if name not in COSTS.kinds.deconvolve.step_ns:
         told.append(f"{name}: measure its time: python -m benchmarks.estimates --write")
     if not any(

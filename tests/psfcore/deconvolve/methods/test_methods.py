@@ -21,9 +21,8 @@ from psfcore.errors import DataError
 from psfcore.image import MaskBit
 from psfcore.noise import Noise
 from psfcore.psf import Psf
-from psfcore.simulate.observe import observe
-from psfcore.simulate.scene import solar_scene
-from studies import edges as edge_study
+from psfcore.simulate.scene import observe, solar_scene
+from studies import methods as method_study
 from tests.psfcore.conftest import delta, gaussian, make_image, make_psf
 from tests.psfcore.deconvolve.scattering import scattering_psf
 
@@ -369,10 +368,10 @@ def test_any_shape_mask_and_type_gives_finite_light(
 
 @pytest.mark.slow
 def test_the_default_is_close_to_a_run_without_edges() -> None:
-    """The errors near edges that README and methods state: 2.5, 2 and 1 % in the bands of the edge study."""
-    psf, cache = edge_study.study_psf(), PreparedPsfs().engine_for
-    for seed in edge_study.SEEDS:
-        (row,) = edge_study.rows(seed, psf, cache, methods=("richardson-lucy",), ways=(None,))
+    """The errors near edges that README and methods state: 2.5, 2 and 1 % in the bands of the study."""
+    psf, cache = method_study.study_psf(), PreparedPsfs().engine_for
+    for seed in method_study.SEEDS:
+        (row,) = method_study.edge_rows(seed, psf, cache, methods=("richardson-lucy",), ways=(None,))
         assert row.edges == "symmetric"
         assert np.all(np.abs(row.bias_pct) <= (2.5, 2.0, 1.0)), row
 

@@ -7,8 +7,8 @@ import pytest
 
 from psfcore.gap.evidence.cells import cells_of, disc_cells, sensitivities
 from psfcore.gap.view import View
-from psfcore.scatter.optics import pick, put
 from psfcore.scatter.reconstruction import Solution
+from psfcore.scatter.total_psf import pick, put
 
 
 def left_in_disc(solution: Solution, n: int, image: np.ndarray) -> np.ndarray:

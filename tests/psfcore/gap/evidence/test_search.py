@@ -21,7 +21,7 @@ from psfcore.gap.evidence.search import NearDisc, cut, displaced, distinguished,
 from psfcore.gap.library.optics import ANGLES_DEG, BETWEEN_THEM, BLURS, DIRECTIONS, HALOS, blur_as
 from psfcore.gap.view import View
 from psfcore.psf import crop_or_pad
-from psfcore.scatter.optics import Blur
+from psfcore.scatter.total_psf import Blur
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.transit import simulate
 from psfcore.transit.occulter import coverage

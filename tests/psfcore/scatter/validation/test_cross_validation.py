@@ -12,8 +12,8 @@ import pytest
 
 from psfcore.errors import DataError
 from psfcore.scatter.inversion import invert
-from psfcore.scatter.optics import Lanes, Optics
 from psfcore.scatter.plots import cross_validation_png
+from psfcore.scatter.total_psf import Lanes, Optics
 from psfcore.scatter.validation.cross_validation import (
     Bands,
     Excess,

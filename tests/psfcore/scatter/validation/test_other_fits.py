@@ -14,12 +14,10 @@ from psfcore.convolution.convolver import Convolver
 from psfcore.errors import DataError
 from psfcore.psf import REACH_GRID_PX
 from psfcore.scatter.inversion import invert
-from psfcore.scatter.optics import Blur
 from psfcore.scatter.reconstruction import Solution
 from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW
-from psfcore.scatter.total_psf import TotalPsf
-from psfcore.scatter.validation import shape_comparison
-from psfcore.scatter.validation.dark_offsets import dark_offset_study, with_offset
+from psfcore.scatter.total_psf import Blur, TotalPsf
+from psfcore.scatter.validation import robustness
 from psfcore.scatter.validation.free_shells import (
     FreeShares,
     free_kernel,
@@ -28,7 +26,12 @@ from psfcore.scatter.validation.free_shells import (
     looseness_of,
     shells,
 )
-from psfcore.scatter.validation.shape_comparison import ComparedShape, compare_shapes
+from psfcore.scatter.validation.robustness import (
+    ComparedShape,
+    compare_shapes,
+    dark_offset_study,
+    with_offset,
+)
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.transit import simulate
 from psfcore.transit.transit import folds
@@ -69,7 +72,7 @@ def test_the_simulated_shape_gains_most() -> None:
 def test_gains_agree_with_the_residuals() -> None:
     """Steps of each fold, and chi2 of the held-out images before and after, computed from pixels."""
     solution = solved()
-    with patch.object(shape_comparison, "SHAPES", {"knee": SHAPES["knee"]}):  # quicker than all shapes
+    with patch.object(robustness, "SHAPES", {"knee": SHAPES["knee"]}):  # quicker than all shapes
         (found,) = compare_shapes(solution)
     slopes = [*solution.total.slopes(solution.inversion.coordinates), bend_slope(solution)]
     blurs = [Blur(slope, solution.transit.shape) for slope in slopes]
@@ -109,7 +112,7 @@ def bend_slope(solution: Solution) -> np.ndarray:
 def test_few_images_have_no_held_out_gain_and_other_shapes_are_refused() -> None:
     few = dataclasses.replace(solved(), part=solved().part[3:8])
     inversion = dataclasses.replace(solved().inversion, shape=SHAPES["knee"])
-    with patch.object(shape_comparison, "SHAPES", {"knee": SHAPES["knee"]}):
+    with patch.object(robustness, "SHAPES", {"knee": SHAPES["knee"]}):
         assert all(shape.held_out_gain is None for shape in compare_shapes(few))
     with pytest.raises(DataError, match=r"unknown-shape.*softened-power-law.*knee"):
         compare_shapes(dataclasses.replace(solved(), inversion=inversion))

@@ -22,7 +22,7 @@ from tests.service.conftest import refusal, upload
 from workers.bulk import image as bulk_image
 from workers.bulk.runs import keep_turns
 from workers.catalogue.catalogue import Catalogue
-from workers.contract.queues import Queue
+from workers.contract.jobs import Queue
 from workers.files import archive as archive_files
 from workers.files.store import Store
 from workers.run.runner import Runner

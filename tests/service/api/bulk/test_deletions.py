@@ -17,7 +17,7 @@ from workers.bulk.runs import keep_turns
 from workers.catalogue.access import Scope
 from workers.catalogue.bulks import Bulks
 from workers.catalogue.tables import ProductRow
-from workers.contract.phases import Phase
+from workers.contract.jobs import Phase
 from workers.settings import Settings
 
 

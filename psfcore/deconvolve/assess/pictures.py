@@ -1,4 +1,4 @@
-"""Measure what deconvolution changes in many images: numbers for each image, and a sheet of thumbnails.
+"""Show what deconvolution changed: a page with six panels for one image; numbers and a sheet of thumbnails for many images.
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "Effects on HRI_EUV images", deconvolved a catalogue
 at a daily cadence "to visually inspect for artifacts". This module sorts the images by artefact score, so that a person
@@ -14,18 +14,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.colors import Normalize
+from matplotlib.colors import LogNorm, Normalize, SymLogNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from psfcore.deconvolve.assess.quality import QualityBit
+from psfcore.deconvolve.assess.changes import Changes, QualityBit, block_means
 from psfcore.drawing.plots import (
     CHANGE,
     CHANGE_LIMIT_PCT,
     GOLD,
     INK,
+    Panel,
+    Place,
     binned,
     change_pct,
+    compared_panels,
+    draw_panels,
     square_root_stretch,
     write_png,
 )
@@ -35,6 +39,11 @@ from psfcore.fits.header import FitsLimits
 from psfcore.fits.images import read_planes
 from psfcore.fits.observation import read_observation
 
+_HISTOGRAM_BLOCK_PX = 4
+_RATIO_MARKS = (0.1, 0.2, 0.3, 0.5, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.5, 2.0, 3.0, 5.0, 10.0)
+_BEFORE, _AFTER = "#1f6fb4", "#d5642f"
+
+Plane = NDArray[np.float64]
 THUMBNAIL_PX = 256
 MOST_ON_SHEET = 60
 DATE_KEYS = ("DATE-BEG", "DATE-OBS", "T_OBS")
@@ -46,7 +55,94 @@ _LETTERS = 48
 _DOUBTFUL, _CLEAN = "#b3261e", "#2b8a6e"
 _CELL_IN, _TEXT_IN, _TITLE_IN = 2.0, 0.62, 0.75
 
-Plane = NDArray[np.float64]
+
+def changes_png(
+    before: Plane, after: Plane, changes: Changes, path: str | Path, *, title: str, unit: str
+) -> None:
+    """Draw before, after, change in percent, difference, ratio and histogram into a PNG file.
+
+    before, after: pixels [y, x] in `unit`; row 0 is drawn at the bottom. changes: the numbers below the panels.
+    """
+    panels = compared_panels(before, after, unit)
+    old, new = panels[0].pixels, panels[1].pixels
+    difference = new - old
+    limit = max(_largest(difference), 1e-12)
+    ratio = np.divide(new, old, out=np.full(old.shape, np.nan), where=old > 0)
+    ratio = np.where(ratio > 0, ratio, np.nan)
+    span = max(1.1, 2 ** _largest(np.log2(ratio)))
+    ends = SymLogNorm(limit / 30, vmin=-limit, vmax=limit)
+    panels += [
+        Panel(f"After - before ({unit})", difference, CHANGE, ends, "both"),
+        Panel("After / before", ratio, CHANGE, LogNorm(1 / span, span), "both"),
+    ]
+    figure = Figure(figsize=(15.6, 11.1), dpi=100, facecolor="white")
+    figure.text(0.045, 0.977, title, fontsize=13, color=INK, va="center", weight="bold")
+    draw_panels(figure, panels, [_place(index) for index in range(5)], before.shape)
+    marks = [mark for mark in _RATIO_MARKS if 1 / span <= mark <= span]
+    ratio_bar = figure.axes[-1]
+    ratio_bar.set_yticks(marks, [f"{mark:g}" for mark in marks])
+    ratio_bar.set_yticks([], minor=True)
+    left, bottom, width, height = _place(5)
+    _draw_histogram(figure.add_axes((left + 0.02, bottom, width, height)), before, after, unit)
+    figure.text(0.045, 0.022, _figures(changes), fontsize=10, color=INK, va="center")
+    write_png(figure, path, pil_kwargs={"compress_level": 3})
+
+
+def _place(index: int) -> Place:
+    row, column = divmod(index, 3)
+    return 0.045 + 0.318 * column, 0.555 - 0.465 * row, 0.266, 0.38
+
+
+def _draw_histogram(axes: Any, before: Plane, after: Plane, unit: str) -> None:
+    """Histogram of block means before and after, with logarithmic bins."""
+    counted = np.isfinite(before) & np.isfinite(after)
+    means = [block_means(plane, counted, _HISTOGRAM_BLOCK_PX) for plane in (before, after)]
+    positive = [values[values > 0] for values in means]
+    if min(values.size for values in positive) == 0:
+        axes.set_axis_off()
+        return
+    low = min(float(np.percentile(values, 0.01)) for values in positive)
+    bins = np.geomspace(low, max(float(values.max()) for values in positive) * 1.01, 121)
+    for values, name, colour in zip(positive, ("before", "after"), (_BEFORE, _AFTER), strict=True):
+        axes.hist(values, bins=bins, histtype="step", color=colour, linewidth=1.6, label=name)
+        for level in np.percentile(values, [1, 99]):
+            axes.axvline(level, color=colour, linewidth=0.9, linestyle=(0, (4, 3)))
+    axes.set(
+        xscale="log",
+        yscale="log",
+        xlabel=f"Mean of {_HISTOGRAM_BLOCK_PX} x {_HISTOGRAM_BLOCK_PX} px ({unit})",
+    )
+    axes.set_title("Blocks by brightness; dashed: percentiles 1, 99", fontsize=11, color=INK, loc="left")
+    axes.tick_params(labelsize=8.5)
+    axes.legend(frameon=False, loc="upper left")
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+
+
+def _figures(changes: Changes) -> str:
+    """The line of text below the panels, for blocks of 4 px and the brightest and darkest 1 % of them."""
+    parts = [
+        f"{row.kind} {row.tail_pct:g} % of {row.block_px} px blocks: {row.sum_pct:+.0f} %, up to {row.up_to_pct:+.0f} %"
+        for row in changes.structures
+        if (row.block_px, row.tail_pct) == (4, 1.0)
+    ]
+    parts += [
+        f"dynamic range (percentile 99 / percentile 1): {_number(row.dynamic_before)} -> {_number(row.dynamic_after)}"
+        for row in changes.ranges
+        if (row.block_px, row.tail_pct) == (4, 1.0)
+    ]
+    parts.append(f"artefact score {changes.artefacts.score:.2f} (inspect from 1)")
+    return "     ".join(parts)
+
+
+def _number(value: float | None) -> str:
+    return "undefined" if value is None else f"{value:.1f}"
+
+
+def _largest(plane: Plane) -> float:
+    """99.5th percentile of the finite absolute values, or 0."""
+    finite = np.abs(plane[np.isfinite(plane)])
+    return float(np.percentile(finite, 99.5)) if finite.size else 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,11 +11,10 @@ from astropy.io.fits import Header
 from scipy.ndimage import gaussian_filter
 
 from psfcore.convolution.convolver import Convolver
-from psfcore.deconvolve.assess.quality import QualityBit
-from psfcore.deconvolve.box import Box
+from psfcore.deconvolve.assess.changes import QualityBit
+from psfcore.deconvolve.extent import Box
 from psfcore.deconvolve.methods.registry import method_names
-from psfcore.deconvolve.region import BoxWork, box_work
-from psfcore.deconvolve.whole import Options, Work
+from psfcore.deconvolve.work import BoxWork, Options, Work, box_work
 from psfcore.errors import DataError
 from psfcore.image import Image, MaskBit
 from psfcore.psf import Psf, squared_radii

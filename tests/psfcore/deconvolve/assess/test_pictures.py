@@ -13,7 +13,7 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from psfcore.deconvolve import run as one_run
-from psfcore.deconvolve.assess.contact_sheet import (
+from psfcore.deconvolve.assess.pictures import (
     BLOCK_PX,
     TAIL_PCT,
     THUMBNAIL_PX,
@@ -27,14 +27,13 @@ from psfcore.deconvolve.assess.contact_sheet import (
 from psfcore.deconvolve.conditions import Conditions
 from psfcore.deconvolve.methods.registry import method_named
 from psfcore.deconvolve.run import Identities, UsedPsf
-from psfcore.deconvolve.whole import Options
+from psfcore.deconvolve.work import Options
 from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits
 from psfcore.image import Image
 from psfcore.psf import Psf
 from psfcore.scatter.power_law import scatter_kernel
-from psfcore.simulate.observe import observe
-from psfcore.simulate.scene import solar_scene
+from psfcore.simulate.scene import observe, solar_scene
 from tests.psfcore.conftest import make_image, make_psf
 
 SIZE = 288

@@ -1,1 +1,0 @@
-"""Code that users and operators add: effects of the gap library, simulators of blind sets."""

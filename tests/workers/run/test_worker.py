@@ -1,0 +1,252 @@
+"""A worker: the database that it serves, its end when it has nothing to do, and the stages that it reports."""
+
+from __future__ import annotations
+
+import logging
+import os
+import random
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from threading import Thread
+from typing import Any
+
+import psutil
+import pytest
+from sqlalchemy import select, text, update
+from sqlalchemy.exc import OperationalError
+
+from psfcore.compiled import KernelFiles, listening
+from tests.in_process import InProcess
+from tests.whole.stack import Missing, Redis, postgres_database
+from tests.workers.databases import BOTH, change, rows
+from tests.workers.jobs import claimed
+from tests.workers.run.processes import started_worker, worker_of
+from workers.broker import app as queue
+from workers.broker.reconciler import reconcile
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.schema import Schema
+from workers.catalogue.tables import DEFAULT_OWNER, JobRow
+from workers.contract.jobs import Phase, Queue
+from workers.files.store import Store
+from workers.run import worker
+from workers.run.attempt import COMPILING
+from workers.run.runner import Runner
+from workers.settings import Settings
+from workers.tasks.context import Context
+
+LEASE_S, IDLE_S = 3.0, 6.0
+STILL_S = 180.0  # longest time without the end of a job, on a busy machine
+SHORT = """
+def task(context, _):
+    context.report("at work", 1, 2)
+    time.sleep(0.03)
+    return "result"
+"""
+WORKER = worker_of(SHORT, f"idle_s={IDLE_S}")
+
+
+def test_workers_of_one_host_name_and_process_id_have_different_names() -> None:
+    """As in containers: each has its own process ids, and may have the host name of another."""
+    code = (
+        "import os, socket\n"
+        "os.getpid = lambda: 1\n"
+        "socket.gethostname = lambda: 'worker'\n"
+        "from workers.run.runner import worker_name\n"
+        "print(worker_name() == worker_name(), worker_name())"
+    )
+    command = [sys.executable, "-c", code]
+    names = {subprocess.run(command, capture_output=True, text=True, check=True).stdout for _ in range(2)}
+    assert len(names) == 2 and all(name.startswith("True worker:1:") for name in names)
+
+
+def test_a_database_that_is_away_is_waited_for(
+    settings: Settings, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    asked: list[int] = []
+
+    def away_twice(_: Schema) -> None:
+        asked.append(1)
+        if len(asked) < 3:
+            raise OperationalError("SELECT", None, Exception("connection refused by s3cret"))
+
+    monkeypatch.setattr(Schema, "check", away_twice)
+    monkeypatch.setattr(worker, "settings", settings)
+    monkeypatch.setattr(worker, "WAIT_S", 0.01)
+    settings.data_dir.mkdir()
+    with caplog.at_level(logging.WARNING, "workers.run.worker"):
+        worker.check_tables()
+    assert len(asked) == 3 and caplog.text.count("waiting for the database: the connection is refused") == 2
+    assert "s3cret" not in caplog.text
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        [sys.executable, "-m", "service.cli", "worker"],
+        pytest.param(
+            [sys.executable, "-m", "celery", "-A", "workers.run.worker", "worker"], marks=pytest.mark.slow
+        ),
+    ],
+    ids=["heliopsf worker", "celery"],
+)
+def test_a_worker_on_a_later_database_ends_with_a_line_and_status_1(
+    settings: Settings, command: list[str]
+) -> None:
+    settings.data_dir.mkdir()
+    catalogue = Catalogue(settings.catalogue_url)
+    catalogue.upgrade()
+    change(catalogue, text("UPDATE alembic_version SET version_num = '9999'"))
+    catalogue.close()
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("HELIOPSF_")}
+    ended = subprocess.run(
+        command,
+        env=kept | {"HELIOPSF_DATA_DIR": str(settings.data_dir), "HELIOPSF_BROKER_URL": "filesystem://"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert ended.returncode == 1, ended.stderr
+    last = ended.stderr.strip().splitlines()[-1]
+    assert last.startswith("Error: the database is at revision 9999"), ended.stderr
+    assert "Traceback" not in ended.stderr
+
+
+@BOTH
+def test_only_jobs_that_a_worker_could_run_keep_it(catalogue: Catalogue) -> None:
+    jobs = catalogue.jobs
+
+    def to_do(*queues: Queue, worker: str = "this worker") -> bool:
+        return jobs.any_to_do([Queue.INTERACTIVE, *queues], LEASE_S, worker)
+
+    assert not to_do()
+    jobs.submit("psf-build", {}, "elsewhere", DEFAULT_OWNER, queue=Queue.BULK)
+    assert not to_do() and to_do(Queue.BULK)
+    job, _ = jobs.submit("psf-build", {}, "here", DEFAULT_OWNER)
+    assert to_do()
+    lease = claimed(catalogue, job.id, worker="another worker")
+    assert to_do(worker="another worker") and not to_do(), "another worker runs it"
+    change(catalogue, update(JobRow).where(JobRow.id == job.id).values(heartbeat_at=time.time() - 60.0))
+    assert to_do(), "its worker is lost"
+    assert jobs.complete(lease, "r") and not to_do(worker="another worker")
+
+
+@pytest.mark.parametrize(
+    ("served", "jobs", "workers", "kills"),
+    [(False, 20, 2, 1), pytest.param(True, 500, 5, 3, marks=pytest.mark.slow)],
+    ids=["folder and SQLite", "Redis and PostgreSQL"],
+)
+def test_each_job_ends_once_and_the_workers_leave(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, served: bool, jobs: int, workers: int, kills: int
+) -> None:
+    with ExitStack() as resources:
+        try:
+            urls = {
+                "broker_url": resources.enter_context(Redis(tmp_path)).url if served else "filesystem://",
+                "database_url": resources.enter_context(postgres_database()) if served else None,
+            }
+        except Missing as missing:
+            pytest.skip(str(missing))
+        quick = {"lease_s": LEASE_S, "heartbeat_s": 0.5, "resubmit_s": 3.0}
+        settings = Settings(data_dir=tmp_path / "data", **quick, **urls)  # type: ignore[arg-type]
+        settings.data_dir.mkdir()
+        catalogue, app = Catalogue(settings.catalogue_url), queue.make_app(settings)
+        resources.callback(catalogue.close)
+        catalogue.upgrade()
+        for number in range(jobs):
+            catalogue.jobs.submit("psf-build", {}, f"job {number}", DEFAULT_OWNER)
+        named = {name: value for name, value in urls.items() if value and name == "database_url"}
+        started = [
+            started_worker(WORKER, settings, tmp_path / f"{number}.log", worker_threads=1, **quick, **named)
+            for number in range(workers)
+        ]
+        processes = [psutil.Process(worker.pid) for worker in started]
+        try:
+            lost, done, chance, deadline = 0, 0, random.Random(0), time.monotonic() + STILL_S
+            while any(worker.poll() is None for worker in started):
+                assert time.monotonic() < deadline, [p.read_text()[-2000:] for p in tmp_path.glob("*.log")]
+                reconcile(catalogue, app, settings)
+                before = done
+                done = len(rows(catalogue, select(JobRow.id).where(JobRow.phase == Phase.COMPLETED)))
+                if done > before:
+                    deadline = time.monotonic() + STILL_S
+                if lost < kills and done > jobs * (lost + 1) / (kills + 2):
+                    lost += 1
+                    killed = processes.pop(chance.randrange(len(processes)))
+                    for process in (killed, *killed.children(recursive=True)):
+                        process.kill()
+                time.sleep(0.2)
+            ended = rows(catalogue, select(JobRow).where(JobRow.phase == Phase.COMPLETED))
+            assert (len(ended), lost) == (jobs, kills)
+            again = caplog.text.count("no heartbeat from its worker; queued again")
+            assert sum(job.attempt for job in ended) == jobs + again, (
+                "only jobs whose worker was silent ran again"
+            )
+            assert sorted(worker.returncode for worker in started) == [-9] * kills + [0] * (workers - kills)
+        finally:
+            for worker in started:
+                if worker.poll() is None:
+                    worker.kill()
+                worker.wait()
+
+
+def test_a_job_that_compiles_says_so(
+    tmp_path: Path, settings: Settings, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A kernel is compiled after its file was looked for in vain, and before its file is written."""
+    files = KernelFiles(str(tmp_path), "f.py311", "source")
+    told: list[tuple[str, int, int]] = []
+    stages: list[str] = []
+
+    def task(context: Context, _: Mapping[str, Any]) -> str:
+        context.report("reading", 0, 20)
+        for _time in range(2):
+            if files.load(("float32",)) is None:
+                row = context.catalogue.jobs.get(context.job_id)
+                stages.append("" if row is None else row.stage)
+                files.save(("float32",), "code")
+            context.report("deconvolving", 1, 20)
+        stages.extend(sorted(context.times.spent))
+        return "0" * 64
+
+    monkeypatch.setattr("workers.tasks.psf_build.psf_build", task)
+    job, _ = catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)
+    runner = Runner(settings, catalogue, Store(settings.data_dir))
+    runner.run(job.id, lambda *progress: told.append(progress))
+    assert told == [("reading", 0, 20), (COMPILING, 0, 1), ("deconvolving", 1, 20), ("deconvolving", 1, 20)]
+    assert stages == [COMPILING, COMPILING, "deconvolving", "reading", "starting"]
+
+
+def test_only_the_thread_that_listens_is_told(tmp_path: Path) -> None:
+    files, told = KernelFiles(str(tmp_path), "f.py311", "source"), []
+    with listening(told.append):
+        other = Thread(target=lambda: files.load(("float64",)))
+        other.start()
+        other.join()
+        assert told == []
+        files.load(("float32",))
+        files.save(("float32",), "code")
+        assert files.load(("float32",)) == "code" and told == [False, True]
+    files.load(("float64",))
+    assert told == [False, True]
+
+
+def test_noise_realisations_are_a_stage_of_their_own(
+    local: InProcess, image_file: Path, psf_file: Path
+) -> None:
+    told: list[tuple[str, int, int]] = []
+    local.deconvolve(
+        image_file,
+        psf_id=local.upload_psf(psf_file)["id"],
+        steps=2,
+        noise=(5.0, 2.0),
+        error_draws=3,
+        progress=lambda *progress: told.append(progress),
+    )
+    draws = [step for stage, step, steps in told if stage == "error estimate" and steps == 3]
+    assert draws == [0, 0, 1, 2, 3]
+    last = told.index(("deconvolving", 2, 2))
+    assert told[last + 1] == ("error estimate", 0, 3), "at once, before the first of them is done"
