@@ -46,7 +46,7 @@ from service.views import JobView, ProductView
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import ImageRow, JobRow, ProductRow, PsfRow, ReportRow
 from workers.contract.requests import Identity
-from workers.intake.compatibility import deprecation, suits
+from workers.intake.compatibility import DEPRECATED_CODE, deprecation, suits
 from workers.intake.psf_choice import ChosenPsf
 from workers.intake.uploads import image_row
 from workers.versions import PsfStatus
@@ -303,7 +303,11 @@ def product(product_id: Identity, request: Request, caller: PageReading, state: 
         psf=psf,
         lost=lost,
         image_lost=image_lost,
-        warnings=[one["message"] for one in row.details["warnings"] if not deprecated or one["code"] != DEPRECATED_CODE],
+        warnings=[
+            one["message"]
+            for one in row.details["warnings"]
+            if not deprecated or one["code"] != DEPRECATED_CODE
+        ],
         deprecated=deprecated,
         redo=_again(row, psf_id="" if better is None else better.id),
         changed=_changed(row.details),
