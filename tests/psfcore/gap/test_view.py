@@ -13,15 +13,14 @@ import psutil
 import pytest
 
 from psfcore.gap.view import View, return_unused_memory
-from tests.psfcore.gap.small_gaps import changed
-from tests.psfcore.gap.small_transits import clean, fit, solution
+from tests.psfcore.gap.small_gaps import changed, clean, fit, solution
 
 MIB = 2**20
 
 
 def test_a_scene_has_the_brightness_of_its_own_image() -> None:
     """The second image is 5 % brighter than the others of its pointing."""
-    transit = changed(clean(12), lambda n, frame: frame.pixels * (1.05 if n == 1 else 1.0))
+    transit = changed(clean(), lambda n, frame: frame.pixels * (1.05 if n == 1 else 1.0))
     view = View(fit(transit))
     of_one, of_next = (float(view.expected[n].mean() / transit.frames[n].pixels.mean()) for n in (1, 2))
     assert of_one == pytest.approx(of_next, rel=2e-3)

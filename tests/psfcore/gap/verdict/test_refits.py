@@ -18,8 +18,7 @@ from psfcore.gap.verdict.posterior import Form, posterior, without_idle
 from psfcore.gap.verdict.refits import Refits, settled_posterior
 from psfcore.gap.view import View
 from studies import gap_calibration
-from tests.psfcore.gap.small_gaps import OFFSET_DN, changed, found
-from tests.psfcore.gap.small_transits import clean, effect, fit
+from tests.psfcore.gap.small_gaps import OFFSET_DN, changed, effect, fit, found, large
 
 OFFSET, BOTH, BLUR = (
     Form(names) for names in (("dark_offset",), ("dark_offset", "core_blur"), ("core_blur",))
@@ -131,9 +130,9 @@ def test_a_field_is_refitted_as_an_effect() -> None:
 @pytest.mark.slow  # test_settled.py has the fast case of a second effect
 def test_a_second_effect_is_found_in_the_discs_beside_one_of_the_unocculted_field() -> None:
     """A gain mismatch, which the discs do not show, and a light leak, which only the discs show."""
-    x = np.indices(clean().shape)[1] / 128 - 0.5
+    x = np.indices(large().shape)[1] / 128 - 0.5
     transit = changed(
-        clean(), lambda n, f: (f.pixels + 6.0 + 20.0 * x) * (1.1 if f.gain_mode == "combined" else 1.0)
+        large(), lambda n, f: (f.pixels + 6.0 + 20.0 * x) * (1.1 if f.gain_mode == "combined" else 1.0)
     )
     solution = fit(transit)
     view = View(solution)
