@@ -60,11 +60,11 @@ def test_the_core_runs_without_the_packages_of_the_extras(tmp_path: Path) -> Non
     subprocess.run([sys.executable, "-c", script], cwd=tmp_path, check=True)
 
 
-def _command_of_the_core(folder: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
-    """Run the command with the packages of the core alone."""
+def _run(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run a command with the packages of the core alone."""
     script = BLOCKED.replace("ALLOWED", repr(CORE | OURS)) + "from service.start import main; main()"
-    command = [sys.executable, "-c", script, *map(str, arguments)]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    words = [sys.executable, "-c", script, *command.split()]
+    return subprocess.run(words, cwd=folder, capture_output=True, text=True)
 
 
 SIMULATE = "simulate transit -o transit --size 128 --images 6 --diffraction known.fits"
@@ -94,27 +94,22 @@ def test_commands_with_local_need_the_core_alone(tmp_path: Path, commands: tuple
     (tmp_path / "small.toml").write_text(SMALL_INSTRUMENT)
     write_psf(tmp_path / "known.fits", size=31)
     for command in commands:
-        done = _command_of_the_core(tmp_path, *command.split())
+        done = _run(command, tmp_path)
         assert done.returncode == 0, (command, done.stderr)
 
 
-@pytest.mark.parametrize(
-    ("command", "package", "extra"),
-    [
+def test_a_command_whose_packages_are_missing_names_the_extra(tmp_path: Path) -> None:
+    write_image(tmp_path / "image.fits")
+    for command, package, extra in (
         ("serve", "sqlalchemy", "service"),
         ("job list", "httpx", "service"),
         ("deconvolve image.fits -o out.fits", "httpx", "service"),
         ("deconvolve image.fits -o out.fits --local --plot out.png", "matplotlib", "plot"),
-    ],
-)
-def test_a_command_whose_packages_are_missing_names_the_extra(
-    tmp_path: Path, command: str, package: str, extra: str
-) -> None:
-    write_image(tmp_path / "image.fits")
-    done = _command_of_the_core(tmp_path, *command.split())
-    assert done.returncode == 1 and done.stderr.count("\n") == 1 and "Traceback" not in done.stderr
-    assert f"the package {package}" in done.stderr and f"'heliopsf[{extra}]'" in done.stderr
-    assert ("--local" in done.stderr) == (package == "httpx")
+    ):
+        done = _run(command, tmp_path)
+        assert done.returncode == 1 and done.stderr.count("\n") == 1 and "Traceback" not in done.stderr
+        assert f"the package {package}" in done.stderr and f"'heliopsf[{extra}]'" in done.stderr, command
+        assert ("--local" in done.stderr) == (package == "httpx")
 
 
 def test_the_core_depends_on_few_packages_and_extras_name_all_that_is_imported() -> None:
