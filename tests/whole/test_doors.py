@@ -16,6 +16,7 @@ from pathlib import Path
 import httpx
 import psutil
 import pytest
+from astropy.io import fits
 
 from service.client.http import Client
 from tests.conftest import write_image
@@ -27,18 +28,8 @@ from workers.settings import Settings
 
 MIB = 2**20
 # Modules that a server or a worker imports only after its start, or that another program may have left in a folder.
-TRAPS = (
-    "kombu",
-    "celery",
-    "celeryconfig",
-    "redis",
-    "service",
-    "workers",
-    "psfcore",
-    "numpy",
-    "matplotlib",
-    "sitecustomize",
-)
+TRAPS = {"kombu", "celery", "celeryconfig", "redis", "service", "workers"}
+TRAPS |= {"psfcore", "numpy", "matplotlib", "sitecustomize"}
 
 
 @dataclass
@@ -51,32 +42,12 @@ class Server:
     traps: Path
     log: Path
 
-    @property
-    def address(self) -> tuple[str, int]:
-        host, port = self.url.removeprefix("http://").split(":")
-        return host, int(port)
-
     def key(self, owner: str = "ann") -> str:
         catalogue = Catalogue(Settings(data_dir=self.data, database_url=None).catalogue_url)
         try:
             return catalogue.keys.make(owner, ALL - {Scope.ADMIN})
         finally:
             catalogue.close()
-
-    def peak_mib(self) -> float:
-        lines = Path(f"/proc/{self.process.pid}/status").read_text().splitlines()
-        return int(next(line for line in lines if line.startswith("VmHWM")).split()[1]) / 1024
-
-
-def trap(folder: Path) -> None:
-    """Put modules into a folder that tell by a file that they were imported."""
-    for name in {*TRAPS, *(sys.stdlib_module_names - {"__future__"})}:
-        if name.startswith("_"):
-            continue
-        (folder / f"{name}.py").write_text(
-            f"import os\nos.close(os.open({str(folder / 'sprung')!r}, os.O_CREAT | os.O_WRONLY))\n"
-            f"raise ImportError('{name} of the working folder was imported')\n"
-        )
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +56,11 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     traps, data, log = folder / "traps", folder / "data", folder / "server.log"
     traps.mkdir()
     data.mkdir(mode=0o755)
-    trap(traps)
+    for name in TRAPS | {one for one in sys.stdlib_module_names - {"__future__"} if not one.startswith("_")}:
+        (traps / f"{name}.py").write_text(
+            f"import os\nos.close(os.open({str(traps / 'sprung')!r}, os.O_CREAT | os.O_WRONLY))\n"
+            f"raise ImportError('{name} of the working folder was imported')\n"
+        )
     settings = {
         "HELIOPSF_DATA_DIR": str(data),
         "HELIOPSF_BROKER_URL": "filesystem://",
@@ -94,10 +69,6 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
         "HELIOPSF_READS_PER_MINUTE": "0",
     }
     cleared = {name: value for name, value in os.environ.items() if not name.startswith("HELIOPSF_")}
-
-    def as_usual() -> None:
-        os.umask(0o022)
-
     with log.open("w") as errors:
         process = subprocess.Popen(
             [sys.executable, "-P", "-m", "service.cli", "serve", "--port", "0"],
@@ -107,7 +78,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
             stderr=errors,
             text=True,
             start_new_session=True,
-            preexec_fn=as_usual,
+            umask=0o022,  # as usual
         )
     assert process.stdout is not None
     try:
@@ -149,20 +120,16 @@ def test_other_users_of_the_machine_read_no_file_of_the_service(server: Server, 
 
 
 def test_requests_that_are_not_http_do_not_fill_the_log(server: Server) -> None:
-    before = server.log.stat().st_size
+    before, address = server.log.stat().st_size, httpx.URL(server.url)
     for _ in range(60):
-        with socket.create_connection(server.address, timeout=10) as connection:
+        with socket.create_connection((address.host, address.port), timeout=10) as connection:
             connection.sendall(b"\x16\x03\x01 this is TLS\r\n\r\n")
             assert connection.recv(100).startswith(b"HTTP/1.1 400")
     assert server.log.read_text()[before:].count("Invalid HTTP request") <= 1
 
 
-def test_a_client_cannot_choose_the_address_that_it_is_counted_under(server: Server) -> None:
+def test_what_a_client_says_as_a_proxy_is_not_believed(server: Server) -> None:
     """Refused keys are counted by address: with an address of its own choice a client could try keys without end."""
-    httpx.get(f"{server.url}/v1/jobs", headers=bearer(server.key()) | {"X-Forwarded-For": "203.0.113.9"})
-    httpx.get(
-        f"{server.url}/v1/jobs", headers={"X-Forwarded-Proto": "https", "X-Forwarded-For": "203.0.113.9"}
-    )
     answer = httpx.post(
         f"{server.url}/uws/jobs",
         data={"KIND": "psf-build", "instrument": "hri_euv"},
@@ -174,11 +141,8 @@ def test_a_client_cannot_choose_the_address_that_it_is_counted_under(server: Ser
 
 def large_file(number: int) -> Iterator[bytes]:
     """A FITS image of 2048 x 2048 px, 16 MiB, piece by piece; each number gives another file."""
-    cards = ("SIMPLE  = T", "BITPIX  = -32", "NAXIS   = 2", "NAXIS1  = 2048", "NAXIS2  = 2048", "END")
-    yield b"".join(
-        f"{card[:10]}{card[10:]:>20}".rstrip(" " if card == "END" else "").ljust(80).encode()
-        for card in cards
-    ).ljust(2880)
+    cards = {"SIMPLE": True, "BITPIX": -32, "NAXIS": 2, "NAXIS1": 2048, "NAXIS2": 2048}
+    yield fits.Header(cards).tostring().encode()
     for piece in range(16):
         yield bytes([0, 0, number, piece]) * (MIB // 4)
     yield bytes(-16 * MIB % 2880)
@@ -186,7 +150,12 @@ def large_file(number: int) -> Iterator[bytes]:
 
 def test_uploads_at_the_same_time_stay_on_the_disk(server: Server) -> None:
     """Eight uploads of 16 MiB at once: the server's memory grows by much less."""
-    ann, before = bearer(server.key()), server.peak_mib()
+
+    def peak_mib() -> float:
+        status = Path(f"/proc/{server.process.pid}/status").read_text()
+        return int(re.findall(r"VmHWM:\s+(\d+)", status)[0]) / 1024
+
+    ann, before = bearer(server.key()), peak_mib()
 
     def send(number: int) -> int:
         address = f"{server.url}/v1/images"
@@ -194,7 +163,7 @@ def test_uploads_at_the_same_time_stay_on_the_disk(server: Server) -> None:
 
     with ThreadPoolExecutor(8) as pool:
         assert set(pool.map(send, range(8))) == {201}
-    assert server.peak_mib() - before < 40
+    assert peak_mib() - before < 40
 
 
 def test_the_log_has_no_traceback(server: Server) -> None:
