@@ -18,6 +18,7 @@ from psfcore.gap.library.registry import LIBRARY
 from psfcore.gap.report.report import gap_report
 from psfcore.gap.verdict import where
 from psfcore.gap.verdict.calibration import Calibration
+from psfcore.gap.verdict.limits import limits
 from psfcore.gap.verdict.posterior import NONE, UNKNOWN, Form
 from psfcore.noise import Noise
 from psfcore.simulate.plan import default_plan
@@ -69,7 +70,6 @@ def test_a_read_pattern_is_not_attributed_to_an_effect(clean: Transit) -> None:
 
 
 def test_a_dark_offset_is_found_with_its_size_and_taken_out() -> None:
-    """A gap of one linear effect: with and without full refits, the same effect is named."""
     full = small_gaps.found()
     assert full.judgement.verdict == "attributed" and full.judgement.answer == ("dark_offset",)
     (fit,) = full.corrected
@@ -82,14 +82,15 @@ def test_a_dark_offset_is_found_with_its_size_and_taken_out() -> None:
     # A wrong dark level biases the fit of the PSF; with the effect in the model the bias is gone.
     bent, straight = (s.inversion.values["total"] for s in (full.solution, fit.solution))
     assert abs(straight - TRUTH.total) < abs(bent - TRUTH.total) - 0.005
-    plain = diagnose(small_gaps.with_offset(), solution=full.solution, library=small_gaps.FEW, refit=False)
-    assert plain.corrected == () and plain.judgement.answer == ("dark_offset",)
-    assert plain.p_value == full.p_value < 1e-10
-    # The limit of the offset is that of the full refit, and above the truth.
-    (limit,), (plain_limit,) = (one.limits.effects["dark_offset"].parameters for one in (full, plain))
-    assert plain_limit.found_90 == limit.found_90 and plain_limit.excluded_95 != limit.excluded_95
+    # The limit of the offset is that of the full refit, and above the truth; the strength that would be found stays.
+    linear = limits(
+        full.model, threshold=full.calibration.threshold(0.9), temperature=full.calibration.temperature
+    )
+    (limit,), (before,) = (one.effects["dark_offset"].parameters for one in (full.limits, linear))
+    assert before.found_90 == limit.found_90 and before.excluded_95 != limit.excluded_95
     assert limit.excluded_95 == pytest.approx(value + 1.645 * sigma, rel=1e-3)
     assert small_gaps.OFFSET_DN < limit.excluded_95 < small_gaps.OFFSET_DN + 1.0
+    assert full.p_value < 1e-10
 
 
 def test_light_lost_by_clipping_is_attributed_to_saturation_fill(clean: Transit) -> None:
@@ -104,7 +105,7 @@ def test_light_lost_by_clipping_is_attributed_to_saturation_fill(clean: Transit)
         for f in clean.frames
     )
     found = diagnose(replace(clean, frames=frames), library=FEW, refit=False)
-    assert found.judgement.answer == ("saturation_fill",)
+    assert found.judgement.answer == ("saturation_fill",) and found.corrected == ()
     fit = found.fits[Form(("saturation_fill",))]
     # The loss is larger inside than at the rim, as simulated.
     value, sigma, _ = fit.values["excess_inside"]
