@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import gc
-import weakref
 from copy import copy
 from dataclasses import replace
 
@@ -39,19 +37,6 @@ class Planes:
     def __init__(self, count: int) -> None:
         self.planes = [np.ones(MIB // 8) for _ in range(count)]
         self.own = self
-
-
-def test_objects_that_refer_to_each_other_are_freed() -> None:
-    gc.disable()
-    try:
-        planes = Planes(1)
-        alive = weakref.ref(planes)
-        del planes
-        assert alive() is not None
-        return_unused_memory()
-        assert alive() is None
-    finally:
-        gc.enable()
 
 
 @pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="the C library is not glibc")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import pytest
 
@@ -74,14 +74,7 @@ def test_a_strong_effect_is_refitted_and_a_weak_one_is_not(evidence: Evidence, c
 
 # ln of the evidence in the linear model; that of each refit, without those that fail; the visible error of the templates; the
 # refits in their order, the hypotheses that are left out, and the most probable one.
-Row = tuple[
-    dict[Names, float],
-    dict[Names, dict[Names, Weighed | float]],
-    float,
-    list[Names],
-    set[Names],
-    Names,
-]
+Row = tuple[dict[Names, float], dict[Names, Any], float, list[Names], set[Names], Names]
 PAIR: dict[Names, float] = {NONE: 0.0, A: 30.0, B: 20.0, AB: 40.0}
 STRONG = 2 * VISIBLE
 ROWS: list[Row] = [
