@@ -43,10 +43,13 @@ class Missing(Exception):
 
 
 class Stack:
-    """A running service; ``workers`` are those that the test started itself (none when embedded)."""
+    """A running service; ``workers`` are those that the test started itself (none when embedded).
 
-    def __init__(self, data: Path, environment: dict[str, str]) -> None:
-        self.data = data
+    working: the working folder of the server, from which it must import nothing; None: that of the tests.
+    """
+
+    def __init__(self, data: Path, environment: dict[str, str], working: Path | None = None) -> None:
+        self.data, self.working = data, working
         self.environment = os.environ | QUICK | {"HELIOPSF_DATA_DIR": str(data)} | environment
         self.server: subprocess.Popen[str] | None = None
         self.workers: list[subprocess.Popen[str]] = []
@@ -57,8 +60,18 @@ class Stack:
         """Start the service at a port; 0: any free one. What it says is in ``server.out``, and its errors in ``server.log``."""
         folder = self.data.parent
         self.server = subprocess.Popen(
-            [sys.executable, "-m", "service.cli", "serve", "--port", str(port)],
+            [
+                sys.executable,
+                *(["-P"] if self.working else []),
+                "-m",
+                "service.cli",
+                "serve",
+                "--port",
+                str(port),
+            ],
             env=self.environment,
+            cwd=self.working,
+            umask=0o022,  # as usual
             stdout=(folder / "server.out").open("w"),
             stderr=(folder / "server.log").open("a"),
             text=True,

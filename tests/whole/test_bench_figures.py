@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks import figures
 from benchmarks.figures import COLLECTED, Figure, figure_of, keep, kind_of_machine, stored, table, tell
-from benchmarks.growth import AXES, FITTED_POINTS, draw, exponent
+from benchmarks.growth import AXES, FITTED_POINTS, exponent
 from benchmarks.race.peers import CONTENDERS, Run, row
 
 GROWTH = Path(__file__).parents[2] / "docs" / "growth"
@@ -93,12 +93,3 @@ def test_the_documentation_shows_a_measured_figure_of_every_quantity() -> None:
     for name, axis in table.items():
         assert f"](growth/{name}.svg)" in PAGE and (GROWTH / f"{name}.svg").is_file()
         assert len(axis["points"]) >= 2 and axis["machine"]
-
-
-def test_equal_numbers_give_equal_figures(tmp_path: Path) -> None:
-    points = [{"n": n, "seconds": 0.1 * n, "mib": 3.0 * n} for n in (1, 2, 4)]
-    axis = {"label": "steps", "what": "a test", "points": points}
-    for name in ("one", "two"):
-        (tmp_path / name).mkdir()
-        draw(tmp_path / name / "steps.svg", axis, "a machine")
-    assert (tmp_path / "one" / "steps.svg").read_bytes() == (tmp_path / "two" / "steps.svg").read_bytes()
