@@ -14,7 +14,7 @@ import pytest
 import yaml
 from sqlalchemy import text
 
-from tests.deploy.kustomization import resources
+from tests.deploy.test_units import resources
 from tests.whole.stack import Missing, postgres_database
 from tests.workers.databases import add, change, rows
 from tests.workers.jobs import bulk_row

@@ -14,10 +14,20 @@ import yaml
 from click.testing import CliRunner
 
 from service.cli.main import main
-from tests.deploy.kustomization import resources
 from workers.settings import Settings
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
+
+
+def resources(folder: Path) -> list[dict[str, Any]]:
+    """The manifests that the kustomization in a folder names, and those of the folders that it names, without its patches."""
+    named = yaml.safe_load((folder / "kustomization.yaml").read_text("utf-8"))["resources"]
+    found: list[dict[str, Any]] = []
+    for path in (folder / name for name in named):
+        found += resources(path) if path.is_dir() else yaml.safe_load_all(path.read_text("utf-8"))
+    return found
+
+
 UNITS = sorted((DEPLOY / "systemd").glob("*.service"))
 MANIFESTS = [one for name in ("base", "migration") for one in resources(DEPLOY / "kubernetes" / name)]
 WORKLOADS = [one for one in MANIFESTS if one["kind"] in ("Deployment", "StatefulSet", "Job")]

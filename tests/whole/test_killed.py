@@ -55,7 +55,7 @@ def test_a_job_of_a_killed_worker_is_done_once_by_another(
     psf_id = stack.client.upload_psf(psf_file)["id"]
     method = {"name": "richardson-lucy", "steps": 40}
     job = stack.client.submit("deconvolve", image_id=image_id, psf_id=psf_id, method=method)
-    wait_for(lambda: stack.client.job(job["id"])["progress"]["step"] > 2, "the job is at work")
+    wait_for(lambda: stack.client.job(job["id"])["progress"]["step"] > 2, "the job is at work", 120)
     stack.kill_workers()  # a service that has started its worker starts another one
     assert stack.client.job(job["id"])["phase"] == "EXECUTING"
     if stack.redis is not None:

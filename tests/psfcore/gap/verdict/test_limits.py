@@ -55,28 +55,30 @@ def strength_of(found: Limits, name: str) -> float:
     return strength
 
 
-def names_it(model: LinearModel, name: str) -> bool:
+def names_it(model: LinearModel, name: str, columns: FieldColumns) -> bool:
     """Whether the answer that the posterior gives contains the effect and not "no gap"."""
-    answer = ANSWER.answer(without_idle(posterior(model).probabilities()))
+    answer = ANSWER.answer(without_idle(posterior(model, columns).probabilities()))
     return NONE not in answer and (name,) in answer
 
 
 @pytest.mark.slow  # the strength of a noncentral chi2 below is the fast case, and the fit of the effect that of what is excluded
 def test_an_effect_of_this_strength_is_found_nine_times_in_ten_and_rarely_excluded(
-    model: LinearModel, limits_of: Of
+    model: LinearModel, columns: FieldColumns, limits_of: Of
 ) -> None:
     """With noise drawn anew each time, by the answer that the posterior itself gives."""
     for name in ("dark_offset", "column_smear"):
         true = strength_of(limits_of(model), name)
         seen = [drawn(model, {(name, 0): true}, seed) for seed in range(DRAWS)]
-        assert 0.82 <= sum(names_it(one, name) for one in seen) / DRAWS <= 0.97, name
+        assert 0.82 <= sum(names_it(one, name, columns) for one in seen) / DRAWS <= 0.97, name
         excluded = [limits_of(one).effects[name].parameters[0].excluded_95 for one in seen]
         above = sum(true > one for one in excluded if one is not None)
         assert above / DRAWS <= 0.05 + 2 * math.sqrt(0.05 * 0.95 / DRAWS), name
 
 
 @pytest.mark.slow
-def test_the_rms_of_a_random_field_is_found_and_bounded(model: LinearModel, limits_of: Of) -> None:
+def test_the_rms_of_a_random_field_is_found_and_bounded(
+    model: LinearModel, columns: FieldColumns, limits_of: Of
+) -> None:
     """The smear as a random field: its two coefficients are drawn anew each time, with the standard deviation that should be found."""
     smear, offset = (effect_of(model.evidence, name) for name in ("column_smear", "dark_offset"))
     # A likely size that these data can show; of a field that is far stronger than its prior, the cause would be "unknown".
@@ -90,7 +92,7 @@ def test_the_rms_of_a_random_field_is_found_and_bounded(model: LinearModel, limi
     for seed in range(DRAWS):
         values = limit.found_90 * rng.normal(size=2)
         seen = drawn(random, {("column_smear", k): float(values[k]) for k in (0, 1)}, seed)
-        found += names_it(seen, "column_smear")
+        found += names_it(seen, "column_smear", columns)
         (after,) = limits_of(seen).effects["column_smear"].parameters
         assert after.excluded_95 is not None
         above += limit.found_90 > after.excluded_95
