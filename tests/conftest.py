@@ -49,7 +49,12 @@ TOGETHER = {
         "tests/workers/tasks/test_gap.py",
         "tests/service/pages/test_transits.py",
     ),
-    "fits": ("tests/psfcore/scatter/", "tests/psfcore/evaluation/", "tests/psfcore/report/"),
+    "fits": (
+        "tests/psfcore/scatter/",
+        "tests/psfcore/evaluation/",
+        "tests/psfcore/report/",
+        "tests/heliopsf/test_heliopsf.py",
+    ),
 }
 
 _CACHE = TemporaryDirectory(prefix="heliopsf-tests-")

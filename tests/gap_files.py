@@ -13,20 +13,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from psfcore.gap import corrected_psf
 from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.library import registry
 from psfcore.gap.report import plot as gap_plot
-from psfcore.scatter import total_psf
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.transit import simulate, write
-from tests.psfcore.gap.small_gaps import FEW, changed, few_sign_flips
+from tests.psfcore.gap.small_gaps import FEW, REACH_PX, changed, few_sign_flips, small_reach
 from tests.transit_files import TRUTH, diffraction
 from workers.tasks import gap as gap_task
 
+__all__ = ["REACH_PX", "small_reach"]  # for the tests that use the files too
 SIZE_PX = 96
 GLOW_DN_S = 25.0
-REACH_PX = 513
 TWO = tuple(effect for effect in FEW if effect.name in ("dark_offset", "saturation_fill"))
 
 
@@ -58,16 +56,6 @@ def write_gap(folder: Path, *, offset_dn: float = 0.0, light_dn_s: float = 0.0) 
     transit = changed(made.transit, lambda n, frame: frame.pixels + offset_dn / frame.exposure_s + light)
     write(replace(made, transit=transit), folder)
     return folder
-
-
-@contextmanager
-def small_reach() -> Iterator[None]:
-    """Make corrected PSFs of REACH_PX px: those of 2048 px take 200 MB. A fit to a field of up to 256 px is the same."""
-    with (
-        patch.object(corrected_psf, "REACH_GRID_PX", REACH_PX),
-        patch.object(total_psf, "REACH_GRID_PX", REACH_PX),
-    ):
-        yield
 
 
 @contextmanager

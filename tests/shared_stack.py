@@ -11,6 +11,7 @@ import fcntl
 import os
 import shutil
 import signal
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from tempfile import mkdtemp
@@ -83,7 +84,8 @@ def _stack(name: str) -> Stack:
         "HELIOPSF_BULK_OUTPUT_ROOTS": str(folder / "out"),
         "HELIOPSF_CACHE_DIR": str(folder / "cache"),
     }
-    stack = Stack(folder / "data", BOTH | OWN[name] | own)
+    working = folder / "working" if name == "keys" else None
+    stack = Stack(folder / "data", BOTH | OWN[name] | own, working)
     with (folder / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if (folder / "started").exists():
@@ -91,9 +93,37 @@ def _stack(name: str) -> Stack:
         else:
             if "PYTEST_XDIST_WORKER" not in os.environ:
                 _end_in_order()
+            if working is not None:
+                _lay_traps(working)
+                (folder / "data").mkdir(mode=0o755)  # readable, as an operator may have made it
             stack.start_server()
             (folder / "started").touch()
     return stack
+
+
+def _lay_traps(folder: Path) -> None:
+    """Put modules into a working folder that tell by the file "sprung" that they were imported.
+
+    They have the names of modules that a server or a worker imports only after its start, or that another program may have left.
+    """
+    folder.mkdir()
+    names = {
+        "kombu",
+        "celery",
+        "celeryconfig",
+        "redis",
+        "service",
+        "workers",
+        "psfcore",
+        "numpy",
+        "matplotlib",
+    }
+    names |= {"sitecustomize"} | {one for one in sys.stdlib_module_names if not one.startswith("_")}
+    for name in names:
+        (folder / f"{name}.py").write_text(
+            f"import os\nos.close(os.open({str(folder / 'sprung')!r}, os.O_CREAT | os.O_WRONLY))\n"
+            f"raise ImportError('{name} of the working folder was imported')\n"
+        )
 
 
 @pytest.fixture(scope="session")

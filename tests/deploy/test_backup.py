@@ -14,9 +14,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 from fastapi.testclient import TestClient
 
 from service.app import create_app
+from service.cli.main import main
 from tests.conftest import write_image, write_psf
 from tests.service.conftest import upload
 from tests.whole.stack import Missing, postgres_database
@@ -110,13 +112,8 @@ def test_a_restored_service_serves_the_same_product(places: Places, tmp_path: Pa
     shutil.rmtree(places.before.data_dir)
     for command in commands(f"restore, {places.kind}"):
         shell(command, places.after, backup)
-    checked = subprocess.run(
-        [sys.executable, "-m", "service.cli", "store", "check"],
-        env=environment(places.after, backup),
-        capture_output=True,
-        text=True,
-    )
-    assert checked.returncode == 0, checked.stdout + checked.stderr
+    checked = CliRunner(env=environment(places.after, backup)).invoke(main, ["store", "check"])
+    assert checked.exit_code == 0, checked.output
     with TestClient(create_app(places.after)) as api:
         again = api.get(f"{product}/file")
         assert again.content == served.content

@@ -7,7 +7,7 @@ import re
 import shutil
 import subprocess
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -69,53 +69,22 @@ def grouped(expression: str) -> set[str]:
     return {label.strip() for labels in lists for label in labels.split(",")}
 
 
-def test_the_conditions_of_a_metric_are_found() -> None:
-    expression = 'sum by (a, b) (heliopsf_x{route=~"/v1/{id}|y",c!="d"}) / heliopsf_y'
-    expected = [("heliopsf_x", [("route", "=~", "/v1/{id}|y"), ("c", "!=", "d")]), ("heliopsf_y", [])]
-    assert list(selectors(expression)) == expected
-    assert grouped(expression) == {"a", "b"}
-
-
-def test_the_service_exports_what_an_expression_names(
-    subtests: pytest.Subtests, exported: dict[str, dict[str, set[str]]]
-) -> None:
+def test_the_service_exports_what_an_expression_names(exported: dict[str, dict[str, set[str]]]) -> None:
     for expression in EXPRESSIONS:
-        with subtests.test(str(expression)):
-            named = list(selectors(expression))
-            assert named
-            known = {"le"} | TARGET_LABELS
-            for name, conditions in named:
-                if name in OF_PROMETHEUS:
+        named = list(selectors(expression))
+        assert named, expression
+        known = {"le"} | TARGET_LABELS
+        for name, conditions in (one for one in named if one[0] not in OF_PROMETHEUS):
+            labels = exported.get(name)
+            assert labels is not None, f"the service exports no metric {name}"
+            known |= set(labels)
+            for label, operator, value in conditions:
+                if label in TARGET_LABELS:
                     continue
-                assert name in exported, f"the service exports no metric {name}"
-                known |= set(exported[name])
-                for label, operator, value in conditions:
-                    if label in TARGET_LABELS:
-                        continue
-                    assert label in exported[name], f"{name} has no label {label}"
-                    if operator == "=":
-                        assert value in exported[name][label], (
-                            f"{name} is never exported with {label}={value}"
-                        )
-            assert grouped(expression) <= known
-
-
-def test_each_alternative_of_a_phase_or_queue_exists(
-    subtests: pytest.Subtests, exported: dict[str, dict[str, set[str]]]
-) -> None:
-    for expression in [one for one in EXPRESSIONS if "phase=~" in one or "queue=~" in one]:
-        with subtests.test(str(expression)):
-            for name, conditions in selectors(expression):
-                for label, operator, value in conditions:
-                    if operator == "=~" and label in ("phase", "queue"):
-                        assert set(value.split("|")) <= exported[name][label]
-
-
-def test_the_alert_of_slow_answers_names_routes_that_exist() -> None:
-    (expression,) = (rule["expr"] for rule in RULES if rule["alert"] == "HeliopsfSlowAnswers")
-    described = json.loads((DEPLOY.parent / "openapi" / "openapi.json").read_text("utf-8"))["paths"]
-    routes = [v for _, cs in selectors(expression) for label, _, v in cs if label == "route"]
-    assert [one for route in routes for one in route.split("|") if one not in described] == []
+                assert label in labels, f"{name} has no label {label}"
+                if operator == "=" or (operator == "=~" and label in ("phase", "queue")):
+                    assert set(value.split("|")) <= labels[label], (name, label, value)
+        assert grouped(expression) <= known, expression
 
 
 def test_every_number_that_describes_the_whole_service_is_taken_once() -> None:
@@ -125,31 +94,22 @@ def test_every_number_that_describes_the_whole_service_is_taken_once() -> None:
         assert re.search(r"\b(max|min) ?(by ?)?\(", expression), expression
 
 
-def test_every_alert_says_what_happened_and_what_to_do() -> None:
+def test_every_alert_says_what_to_do_has_a_case_and_names_routes_that_exist() -> None:
+    tested = (DEPLOY / "prometheus" / "alerts_test.yml").read_text("utf-8")
     assert len({rule["alert"] for rule in RULES}) == len(RULES)
     for rule in RULES:
         assert set(rule["annotations"]) == {"summary", "action"}, rule["alert"]
         assert rule["labels"]["severity"] in ("warning", "critical"), rule["alert"]
+        assert rule["alert"] in tested
+    (expression,) = (rule["expr"] for rule in RULES if rule["alert"] == "HeliopsfSlowAnswers")
+    described = json.loads((DEPLOY.parent / "openapi" / "openapi.json").read_text("utf-8"))["paths"]
+    routes = [v for _, cs in selectors(expression) for label, _, v in cs if label == "route"]
+    assert routes and [one for route in routes for one in route.split("|") if one not in described] == []
 
 
-def test_panels_have_titles_of_their_own_and_do_not_overlap() -> None:
-    ids = [panel["id"] for panel in DASHBOARD["panels"]]
-    assert len(set(ids)) == len(ids)
-    cells: set[tuple[int, int]] = set()
-    for panel in DASHBOARD["panels"]:
-        place = panel["gridPos"]
-        assert place["x"] + place["w"] <= 24 and panel["title"], panel["id"]
-        own = {
-            (place["x"] + column, place["y"] + line)
-            for column in range(place["w"])
-            for line in range(place["h"])
-        }
-        assert not own & cells, panel["title"]
-        cells |= own
-
-
-@pytest.fixture
-def promtool() -> Callable[..., str]:
+def test_prometheus_accepts_rules_configuration_and_dashboard_and_alerts_fire_when_they_should(
+    tmp_path: Path,
+) -> None:
     binary = shutil.which("promtool")
     if binary is None:
         pytest.skip("promtool is not installed (Debian: the package prometheus contains it)")
@@ -161,27 +121,13 @@ def promtool() -> Callable[..., str]:
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout
 
-    return run
-
-
-def test_prometheus_accepts_the_rules_and_the_configuration(promtool: Callable[..., str]) -> None:
-    assert f"{len(RULES)} rules found" in promtool("check", "rules", "alerts.yml")
-    promtool("check", "config", "--syntax-only", "prometheus.yml")
-
-
-def test_alerts_fire_when_they_should_and_only_then(promtool: Callable[..., str]) -> None:
-    promtool("test", "rules", "alerts_test.yml")
-    tested = (DEPLOY / "prometheus" / "alerts_test.yml").read_text("utf-8")
-    assert [rule["alert"] for rule in RULES if rule["alert"] not in tested] == []
-
-
-def test_prometheus_can_parse_every_expression_of_the_dashboard(
-    promtool: Callable[..., str], tmp_path: Path
-) -> None:
+    assert f"{len(RULES)} rules found" in run("check", "rules", "alerts.yml")
+    run("check", "config", "--syntax-only", "prometheus.yml")
+    run("test", "rules", "alerts_test.yml")
     rules = [
         {"record": f"panel:{number}", "expr": target["expr"].replace("$job", "heliopsf")}
         for number, target in enumerate(target for panel in PANELS for target in panel["targets"])
     ]
     file = tmp_path / "dashboard.yml"
     file.write_text(yaml.safe_dump({"groups": [{"name": "dashboard", "rules": rules}]}))
-    assert f"{len(rules)} rules found" in promtool("check", "rules", str(file))
+    assert f"{len(rules)} rules found" in run("check", "rules", str(file))

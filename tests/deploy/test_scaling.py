@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 import time
+from contextlib import ExitStack
 from math import ceil
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import pytest
 import yaml
 from sqlalchemy import text
 
-from tests.deploy.kustomization import resources
+from tests.deploy.test_units import resources
 from tests.whole.stack import Missing, postgres_database
 from tests.workers.databases import add, change, rows
 from tests.workers.jobs import bulk_row
@@ -94,6 +95,9 @@ def check_selectors(manifests: list[Manifest]) -> None:
 
 
 def test_the_base_gives_its_pods_time_and_names_what_there_is() -> None:
+    for path in (one for one in KUBERNETES.rglob("*.yaml") if one.name != "kustomization.yaml"):
+        kustomization = yaml.safe_load((path.parent / "kustomization.yaml").read_text("utf-8"))
+        assert path.name in kustomization["resources"], path
     base = resources(KUBERNETES / "base")
     check_time_to_stop(base)
     check_selectors(base)
@@ -107,18 +111,13 @@ def test_the_base_gives_its_pods_time_and_names_what_there_is() -> None:
     assert of_kind(base, "Deployment")["heliopsf-api"]["spec"]["replicas"] > 1, "its budget keeps one of them"
 
 
-def test_every_manifest_is_named_by_a_kustomization() -> None:
-    for path in KUBERNETES.rglob("*.yaml"):
-        if path.name != "kustomization.yaml":
-            kustomization = yaml.safe_load((path.parent / "kustomization.yaml").read_text("utf-8"))
-            assert path.name in kustomization["resources"], path
-
-
 def test_kubectl_renders_what_the_files_say() -> None:
     for name in ("base", "migration"):
-        kinds = [sorted((m["kind"], m["metadata"]["name"]) for m in found) for found in (
-            rendered(name), resources(KUBERNETES / name))]  # fmt: skip
-        assert kinds[0] == kinds[1]
+        ours, theirs = (
+            sorted((one["kind"], one["metadata"]["name"]) for one in found)
+            for found in (resources(KUBERNETES / name), rendered(name))
+        )
+        assert ours == theirs
 
 
 def test_the_overlay_has_a_scaled_worker_for_each_queue() -> None:
@@ -154,33 +153,33 @@ def waiting(catalogue: Catalogue, queue: Queue, jobs: int, phase: Phase = Phase.
     ) for number in range(jobs)))  # fmt: skip
 
 
-def asked(catalogue: Catalogue, queue: Queue) -> tuple[int, int]:
-    """The number that KEDA reads for a queue, and the workers that it then wants."""
-    (number,) = rows(catalogue, text(TRIGGERS[queue]["query"]))
-    return int(number), ceil(number / int(TRIGGERS[queue]["targetQueryValue"]))
+def test_keda_counts_the_jobs_of_each_queue() -> None:
+    with ExitStack() as opened:
+        try:
+            url = opened.enter_context(postgres_database())
+        except Missing as missing:
+            pytest.skip(str(missing))
+        catalogue = Catalogue(Settings(database_url=url).catalogue_url)
+        opened.callback(catalogue.close)
+        catalogue.upgrade()
 
+        def read(queue: Queue) -> tuple[int, int]:
+            """The number that KEDA reads for a queue, and the workers that it then starts."""
+            (number,) = rows(catalogue, text(TRIGGERS[queue]["query"]))
+            return int(number), ceil(number / int(TRIGGERS[queue]["targetQueryValue"]))
 
-def test_keda_counts_the_jobs_of_each_queue(subtests: pytest.Subtests) -> None:
-    try:
-        with postgres_database() as url:
-            catalogue = Catalogue(Settings(database_url=url).catalogue_url)
-            catalogue.upgrade()
-            for queue in Queue:
-                for jobs, workers in ((0, 0), (1, 1), (1000, 50 if queue == Queue.BULK else 1000)):
-                    with subtests.test(f"{queue}, {jobs} jobs"):
-                        waiting(catalogue, queue, max(jobs - 1, 0))
-                        waiting(catalogue, queue, min(jobs, 1), Phase.EXECUTING)
-                        waiting(catalogue, queue, 3, Phase.COMPLETED)  # does not count
-                        for other in set(Queue) - {queue}:
-                            waiting(catalogue, other, 7)
-                        assert asked(catalogue, queue) == (jobs, workers)
-                        change(catalogue, text("DELETE FROM jobs"))
-            run = bulk_row("o", total=1000, done=390, failed=10)
-            ended = bulk_row("o", "ended", phase=BulkPhase.CANCELLED, total=50)
-            add(catalogue, run, ended, bulk_row("o", "listing", listed=False))
-            add(catalogue, JobRow(id="turn", owner="o", kind="bulk", parameters={}, phase=Phase.QUEUED,
-                queue=Queue.BULK, request_key="turn", created_at=0.0))  # fmt: skip
-            assert asked(catalogue, Queue.BULK) == (601, 31), "600 images, and a run that is being listed"
-            catalogue.close()
-    except Missing as missing:
-        pytest.skip(str(missing))
+        for queue in Queue:
+            for jobs, workers in ((0, 0), (1, 1), (1000, 50 if queue == Queue.BULK else 1000)):
+                waiting(catalogue, queue, max(jobs - 1, 0))
+                waiting(catalogue, queue, min(jobs, 1), Phase.EXECUTING)
+                waiting(catalogue, queue, 3, Phase.COMPLETED)  # does not count
+                for other in set(Queue) - {queue}:
+                    waiting(catalogue, other, 7)
+                assert read(queue) == (jobs, workers), queue
+                change(catalogue, text("DELETE FROM jobs"))
+        run = bulk_row("o", total=1000, done=390, failed=10)
+        ended = bulk_row("o", "ended", phase=BulkPhase.CANCELLED, total=50)
+        add(catalogue, run, ended, bulk_row("o", "listing", listed=False))
+        waiting(catalogue, Queue.BULK, 1)  # the turn of a run is a job too
+        change(catalogue, text("UPDATE jobs SET kind = 'bulk'"))
+        assert read(Queue.BULK) == (601, 31), "600 images, and a run that is being listed"

@@ -6,14 +6,12 @@ import json
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import fields
+from dataclasses import fields, replace
 from datetime import UTC, datetime
-from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
-from unittest.mock import patch
 
 import matplotlib
 import numpy as np
@@ -22,18 +20,19 @@ from astropy.io import fits
 from matplotlib.figure import Figure
 
 import heliopsf
+from heliopsf import transits
 from psfcore.build import known_diffraction
 from psfcore.deconvolve.conditions import Conditions
 from psfcore.deconvolve.methods.registry import method_named
 from psfcore.fits.blocks import LIMITS
 from psfcore.fits.observation import read_observation
 from psfcore.gap import diagnose
-from psfcore.scatter import fit as fit_module
-from psfcore.scatter.as_published import free_fit
+from psfcore.scatter.fit import TransitFit
 from psfcore.simulate.transit import write
+from psfcore.transit.transit import Transit
 from tests.conftest import write_image, write_psf
 from tests.fitted_psfs import EARLY, LATE, fitted_psf, interpolated_on_a_small_grid, write_fitted
-from tests.psfcore.small_transits import SCATTER, observed, sky
+from tests.psfcore.small_transits import fitted, observed, sky
 
 HEAVY = {"astropy", "celery", "fastapi", "httpx", "matplotlib", "numba", "numpy"}
 HEAVY |= {"pydantic", "scipy", "sqlalchemy"}
@@ -45,38 +44,32 @@ def _small_grid() -> Iterator[None]:
         yield
 
 
-def loaded_by(code: str) -> set[str]:
-    """Top-level modules that a new process has loaded after running ``code``."""
-    script = f"{code}\nimport sys, json; print(json.dumps(sorted(sys.modules)))"
-    done = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)
-    return set(json.loads(done.stdout.splitlines()[-1]))
-
-
-def test_the_import_loads_nothing_heavy() -> None:
-    loaded = loaded_by("import heliopsf; dir(heliopsf)")
-    assert loaded & HEAVY == set()
-    assert {name for name in loaded if name.split(".")[0] in ("psfcore", "service", "workers")} == set()
-
-
-def test_the_client_loads_no_numerics_and_no_server() -> None:
-    loaded = loaded_by("from heliopsf import Client; Client('http://127.0.0.1:1').close()")
-    assert "httpx" in loaded
-    assert loaded & {"numba", "scipy", "numpy", "astropy", "fastapi", "sqlalchemy", "celery"} == set()
-
-
-def test_the_functions_load_no_server() -> None:
-    loaded = loaded_by("from heliopsf import deconvolve, build_psf, read_psf, fit_scatter, diagnose_gap")
-    assert "psfcore.scatter.fit" in loaded
-    assert loaded & {"fastapi", "sqlalchemy", "celery", "httpx", "service", "sunpy", "matplotlib"} == set()
-    ours = {name for name in loaded if name.startswith("workers.")}
-    assert ours == {"workers.machine"}
-
-
-def test_the_core_needs_no_extra() -> None:
-    loaded = loaded_by(
-        "from heliopsf import deconvolve, build_psf, psf_for, Psf, Deconvolution; import psfcore.build"
-    )
-    assert loaded & {"threadpoolctl", "matplotlib", "sunpy", "jinja2", "click"} == set()
+def test_what_an_import_loads() -> None:
+    """Of heliopsf itself nothing heavy, of the client no numerics, of the functions no server, of the core no extra."""
+    numerics, servers = {"numba", "scipy", "numpy", "astropy"}, {"fastapi", "sqlalchemy", "celery"}
+    extras = {"threadpoolctl", "matplotlib", "sunpy", "jinja2", "click"}
+    functions = servers | {"httpx", "service", "sunpy", "matplotlib"}
+    for code, needed, refused in (
+        ("import heliopsf; dir(heliopsf)", "heliopsf", HEAVY | {"psfcore", "service", "workers"}),
+        ("from heliopsf import Client; Client('http://127.0.0.1:1').close()", "httpx", numerics | servers),
+        (
+            "from heliopsf import deconvolve, build_psf, read_psf, fit_scatter, diagnose_gap",
+            "psfcore.scatter.fit",
+            functions,
+        ),
+        (
+            "from heliopsf import deconvolve, build_psf, psf_for, Psf, Deconvolution; import psfcore.build",
+            "psfcore.build",
+            extras,
+        ),
+    ):
+        script = f"{code}\nimport sys, json; print(json.dumps(sorted(sys.modules)))"
+        done = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)
+        loaded = set(json.loads(done.stdout.splitlines()[-1]))
+        assert needed in loaded and loaded & refused == set(), code
+        if refused is functions:
+            ours = {name for name in loaded if name.startswith("workers.")}
+            assert ours == {"workers.machine"}
 
 
 def test_every_name_is_there_with_a_docstring_and_no_other() -> None:
@@ -123,14 +116,24 @@ def test_errors_have_a_code(tmp_path: Path) -> None:
         heliopsf.read_psf(tmp_path / "text.fits")
     with pytest.raises(heliopsf.ServiceError):
         heliopsf.Client("http://127.0.0.1:1").health()
+    with pytest.raises(heliopsf.DataError, match=r"known_psf.*hri_euv.*got my-telescope"):
+        known_diffraction("my-telescope")
 
 
-def test_a_transit_is_fitted_and_the_fit_drawn(tmp_path: Path) -> None:
+def test_a_transit_is_fitted_and_the_fit_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The fit is that of psfcore, which other tests use too."""
     write(observed(sky()), tmp_path / "transit")
-    with patch.object(fit_module, "free_fit", partial(free_fit, subsets=4)):
-        fit = heliopsf.fit_scatter(tmp_path / "transit", threads=2)
+    asked: list[dict[str, Any]] = []
+
+    def fit_transit(transit: Transit, **how: Any) -> TransitFit:
+        np.testing.assert_allclose(transit.frames[0].pixels, fitted().transit.frames[0].pixels, atol=1.0)
+        asked.append(how)
+        return replace(fitted(), transit=transit)
+
+    monkeypatch.setattr(transits, "fit_transit", fit_transit)
+    fit = heliopsf.fit_scatter(tmp_path / "transit", threads=2, seed=4)
+    assert [(how["threads"], how["seed"], how["shape"]) for how in asked] == [(2, 4, "softened-power-law")]
     assert isinstance(fit, heliopsf.ScatterFit)
-    assert abs(fit.inversion.values["total"] - SCATTER.total) < 0.03
     psf = fit.psf(version="0.3.0")
     psf.write(tmp_path / "fitted.fits")
     again = heliopsf.read_psf(tmp_path / "fitted.fits")
@@ -154,11 +157,6 @@ def test_a_gap_is_diagnosed_with_the_coverage_that_was_asked_for(
     heliopsf.diagnose_gap(tmp_path / "transit", coverage=0.7, seed=4)
     heliopsf.diagnose_gap(tmp_path / "transit")
     assert [(how["coverage"], how["seed"]) for how in asked] == [(0.7, 4), (0.9, 1)]
-
-
-def test_a_diffraction_that_is_not_known_is_refused() -> None:
-    with pytest.raises(heliopsf.DataError, match=r"known_psf.*hri_euv.*got my-telescope"):
-        known_diffraction("my-telescope")
 
 
 @pytest.fixture(autouse=True)

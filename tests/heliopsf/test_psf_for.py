@@ -15,6 +15,7 @@ import heliopsf
 from psfcore.instruments import files
 from service.cli.local import local
 from tests.conftest import SMALL_INSTRUMENT, write_image
+from tests.heliopsf.test_forms import cards
 from workers.contract.identities import psf_identity
 from workers.contract.requests import PsfBuild
 from workers.machine import psf_cache
@@ -51,6 +52,9 @@ def test_the_psf_is_that_of_the_service(small: Path, tmp_path: Path) -> None:
     psf = heliopsf.psf_for(image)
     assert psf.provenance["psf_id"] == psf_identity(PsfBuild(instrument="small"))
     mine = heliopsf.deconvolve(image, full=True)
+    header = fits.getheader(image)
+    for known in (header, dict(header), mine.image):
+        np.testing.assert_array_equal(heliopsf.psf_for(known).kernel, psf.kernel)
     with local() as service:
         product = service.deconvolve(image, tmp_path / "product.fits")
     assert product["psf_id"] == psf.provenance["psf_id"] and product["psf_version"] == psf.version
@@ -58,7 +62,7 @@ def test_the_psf_is_that_of_the_service(small: Path, tmp_path: Path) -> None:
         np.testing.assert_array_equal(hdus[0].data, mine.pixels.astype("f4"))
         np.testing.assert_array_equal(hdus["QUALITY"].data, mine.quality)
         own = {card.keyword for card in hdus[0].header.cards} - {"PRODID", "INPSHA", "DCNVALGV"}
-    result = heliopsf.deconvolve(sunpy.map.Map(fits.getdata(image), _cards("SMALL")))
+    result = heliopsf.deconvolve(sunpy.map.Map(fits.getdata(image), cards(detector="SMALL")))
     assert {key for key in own if key.startswith(("PSF", "DCNV"))} == {
         key.upper() for key in result.meta if key.startswith(("psf", "dcnv"))
     }
@@ -82,14 +86,6 @@ def test_a_deconvolution_builds_the_total_psf_alone(
     assert again.psf.components == {} and len(psf_cache().psfs()) == 1
 
 
-def test_a_header_is_enough(small: Path, tmp_path: Path) -> None:
-    image = image_file(tmp_path / "image.fits")
-    header = fits.getheader(image)
-    wanted = heliopsf.psf_for(image).kernel
-    for known in (header, dict(header), heliopsf.deconvolve(image).image):
-        np.testing.assert_array_equal(heliopsf.psf_for(known).kernel, wanted)
-
-
 def test_the_psf_of_a_binned_image_is_rebinned(small: Path, tmp_path: Path) -> None:
     binned = image_file(tmp_path / "binned.fits", CDELT1=4.0, CDELT2=4.0)
     psf = heliopsf.psf_for(binned)
@@ -104,8 +100,8 @@ def test_the_psf_of_a_binned_image_is_rebinned(small: Path, tmp_path: Path) -> N
 def test_an_unknown_telescope_is_refused_with_the_ways_on(small: Path) -> None:
     pixels = np.ones((40, 40)) + np.eye(40)
     for ask in (heliopsf.psf_for, heliopsf.deconvolve):
-        with pytest.raises(heliopsf.DataError, match=r"no-psf-for-instrument: .*'OTHER'.*psf in") as caught:
-            ask(sunpy.map.Map(pixels, _cards("OTHER")))
+        with pytest.raises(heliopsf.DataError, match=r"no-psf-for-instrument: .*OTHER'.*psf in") as caught:
+            ask(sunpy.map.Map(pixels, cards(detector="OTHER")))
         assert [one["name"] for one in caught.value.fields["instruments"]] == ["small"]
     with pytest.raises(heliopsf.DataError, match="unnamed instrument"):
         heliopsf.deconvolve(pixels)
@@ -115,7 +111,7 @@ def test_telescopes_in_a_list_get_each_its_own_psf(small: Path, tmp_path: Path) 
     text = (SMALL_INSTRUMENT + MATCH).replace('"small"', '"wide"').replace('"SMALL"', '"WIDE"')
     (small / "wide.toml").write_text(text.replace("diameter_mm = 4.0", "diameter_mm = 3.0"))
     files.match_table.cache_clear()
-    maps = [sunpy.map.Map(np.ones((40, 40)) + np.eye(40), _cards(name)) for name in ("SMALL", "WIDE")]
+    maps = [sunpy.map.Map(np.ones((40, 40)) + np.eye(40), cards(detector=name)) for name in ("SMALL", "WIDE")]
     results = heliopsf.deconvolve(maps)
     assert [result.meta["psfname"] for result in results] == ["small", "wide"]
 
@@ -146,11 +142,3 @@ def test_a_cache_that_cannot_be_used_is_a_warning(
         built = heliopsf.build_psf(small_toml, size=64)
     np.testing.assert_array_equal(built.kernel, psf.kernel)
     assert built.provenance == psf.provenance
-
-
-def _cards(detector: str) -> dict[str, Any]:
-    return {
-        "detector": detector, "wavelnth": 171, "waveunit": "angstrom", "cdelt1": 2.0, "cdelt2": 2.0,
-        "cunit1": "arcsec", "cunit2": "arcsec", "ctype1": "HPLN-TAN", "ctype2": "HPLT-TAN",
-        "date-obs": "2024-03-01T12:00:00", "hgln_obs": 0.0, "hglt_obs": 0.0, "dsun_obs": 1.496e11,
-    }  # fmt: skip

@@ -54,6 +54,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"saturation_dn": 5 * u.m}, "bad-quantity"),
     ({"saturation_dn": "high"}, "bad-quantity"),
     ({"saturation_dn": [1, 2]}, "bad-quantity"),
+    ({"smap": pixels() * u.DN, "saturation_dn": 5 * u.DN / u.s}, "no-exposure"),
     ({"plate_scale_arcsec": 2 * u.kg}, "bad-quantity"),
     ({"iterations": 2.5}, "bad-steps"),
     ({"iterations": "20"}, "bad-steps"),
@@ -92,11 +93,6 @@ def test_a_value_that_does_not_fit_is_a_data_error_with_its_code(psf: heliopsf.P
     for read in (heliopsf.build_psf, heliopsf.read_psf):
         with pytest.raises(heliopsf.DataError, match="'aia_171'"):  # the instrument that is meant
             read("aia171")
-
-
-def test_a_level_per_second_needs_an_exposure_time(psf: heliopsf.Psf) -> None:
-    with pytest.raises(heliopsf.DataError, match="no-exposure"):
-        heliopsf.deconvolve(pixels() * u.DN, psf, saturation_dn=5 * u.DN / u.s)
 
 
 def test_a_psf_may_be_named_by_its_instrument(small_toml: Path, psf: heliopsf.Psf) -> None:

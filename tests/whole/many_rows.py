@@ -6,6 +6,7 @@ import random
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from sqlalchemy import Engine, create_engine, event, text
@@ -30,7 +31,6 @@ LINES = 200  # 20 instruments, 5 channels, 2 kinds
 A_SERIES_YEARS = 50  # certified PSFs that follow one another in a series, at most
 YEAR_S = 31_557_600.0
 ONE_IN = {"certified": 10, "deprecated": 5}  # of PSFs
-DEEP = 500  # rows before the last one that a cursor stands at, where there are so many
 MUCH_USED_PCT = 10  # of products made with the first deprecated PSF
 
 
@@ -125,39 +125,32 @@ Question = Callable[[Archive, random.Random], Any]
 
 
 def _rows(table: Any, **equal: str) -> Question:
-    def ask(archive: Archive, rng: random.Random) -> Any:
-        return archive.catalogue.page(table, owner=OWNER, limit=51, **equal)
-
-    return ask
+    return lambda archive, rng: archive.catalogue.page(table, owner=OWNER, limit=51, **equal)
 
 
-def _deep_products(archive: Archive, rng: random.Random) -> Any:
+def _products(archive: Archive, rng: random.Random, *, deep: bool = False, **equal: str) -> Any:
+    """A page of products; deep: from a place in the middle."""
     n = rng.randrange(archive.size.products)
-    after = (1e9 + n, archive.product_id(n))
-    return archive.catalogue.page(ProductRow, owner=OWNER, limit=51, after=after)
+    after = (1e9 + n, archive.product_id(n)) if deep else None
+    return archive.catalogue.page(ProductRow, owner=OWNER, limit=51, after=after, **equal)
 
 
 def _products_of_psf(archive: Archive, rng: random.Random) -> Any:
-    psf_id = archive.psf_id(rng.randrange(archive.size.psfs))
-    return archive.catalogue.page(ProductRow, owner=OWNER, limit=51, psf_id=psf_id)
-
-
-def _products_of_much_used_psf(archive: Archive, rng: random.Random) -> Any:
-    n = rng.randrange(archive.size.products)
-    after = (1e9 + n, archive.product_id(n))
-    much = archive.psf_id(3 * LINES)
-    return archive.catalogue.page(ProductRow, owner=OWNER, limit=51, psf_id=much, after=after)
+    return _products(archive, rng, psf_id=archive.psf_id(rng.randrange(archive.size.psfs)))
 
 
 def _products_of_image(archive: Archive, rng: random.Random) -> Any:
-    image_id = archive.product_id(rng.randrange(archive.size.products) // 4)
-    return archive.catalogue.page(ProductRow, owner=OWNER, limit=51, image_id=image_id)
+    return _products(archive, rng, image_id=archive.product_id(rng.randrange(archive.size.products) // 4))
 
 
 def _line(rng: random.Random) -> dict[str, str]:
     n = rng.randrange(LINES)
     kind = "diffraction" if n % 2 else "total"
     return {"instrument": f"instrument_{n // 10}", "channel": str(100 + n // 2 % 5), "kind": kind}
+
+
+def _instrument(rng: random.Random) -> dict[str, str]:
+    return {"instrument": f"instrument_{rng.randrange(20)}"}
 
 
 def _psfs(*, deep: bool = False, pick: Callable[[random.Random], dict[str, Any]]) -> Question:
@@ -178,12 +171,10 @@ def _at(rng: random.Random) -> float:
     return rng.random() * 3 * YEAR_S
 
 
-def _best(archive: Archive, rng: random.Random) -> Any:
-    return psf_choice.look(archive.catalogue, PsfFilter(**_line(rng), valid_at=_at(rng)), OWNER, "now")
-
-
-def _best_in_context(archive: Archive, rng: random.Random) -> Any:
-    return psf_choice.look(archive.catalogue, PsfFilter(**_line(rng), valid_at=_at(rng)), OWNER, "all")
+def _best(context: str) -> Question:
+    return lambda archive, rng: psf_choice.look(
+        archive.catalogue, PsfFilter(**_line(rng), valid_at=_at(rng)), OWNER, context
+    )
 
 
 def _interpolated(context: str | None) -> Question:
@@ -238,9 +229,11 @@ def _status(archive: Archive, rng: random.Random) -> Any:
 # Every list and every look-up that the service answers from the catalogue, by name.
 QUESTIONS: dict[str, Question] = {
     "products": _rows(ProductRow),
-    "products, anywhere": _deep_products,
+    "products, anywhere": partial(_products, deep=True),
     "products of a PSF": _products_of_psf,
-    "products of a PSF that has very many": _products_of_much_used_psf,
+    "products of a PSF that has very many": lambda archive, rng: _products(
+        archive, rng, deep=True, psf_id=archive.psf_id(3 * LINES)
+    ),
     "products of an image": _products_of_image,
     "products of no image": _rows(ProductRow, image_id="f" * 64),
     "a product's lineage": _lineage,
@@ -249,9 +242,7 @@ QUESTIONS: dict[str, Question] = {
     "affected by a PSF that has very many": _affected_by_much_used_psf,
     "PSFs": _psfs(pick=lambda rng: {}),
     "PSFs, anywhere": _psfs(deep=True, pick=lambda rng: {}),
-    "PSFs of an instrument": _psfs(
-        deep=True, pick=lambda rng: {"instrument": f"instrument_{rng.randrange(20)}"}
-    ),
+    "PSFs of an instrument": _psfs(deep=True, pick=_instrument),
     "PSFs of no instrument": _psfs(pick=lambda rng: {"instrument": "none"}),
     "PSFs of a channel": _psfs(pick=lambda rng: {"channel": str(100 + rng.randrange(5))}),
     "PSFs of a kind": _psfs(pick=lambda rng: {"kind": "diffraction"}),
@@ -263,16 +254,14 @@ QUESTIONS: dict[str, Question] = {
     "PSFs of a series": _psfs(pick=_line),
     "PSFs of a series, certified": _psfs(pick=lambda rng: {**_line(rng), "status": "certified"}),
     "PSFs of a series and a version": _psfs(pick=lambda rng: {**_line(rng), "version": "1.0.0"}),
-    "PSFs of an instrument and no version": _psfs(
-        pick=lambda rng: {"instrument": f"instrument_{rng.randrange(20)}", "version": "99.0.0"}
-    ),
+    "PSFs of an instrument and no version": _psfs(pick=lambda rng: {**_instrument(rng), "version": "99.0.0"}),
     "PSFs valid at a time": _psfs(pick=lambda rng: {"valid_at": _at(rng)}),
     "PSFs of an instrument valid at a time": _psfs(
-        pick=lambda rng: {"instrument": f"instrument_{rng.randrange(20)}", "valid_at": _at(rng)}
+        pick=lambda rng: {**_instrument(rng), "valid_at": _at(rng)}
     ),
     "PSFs of a series in a context": _in_context,
-    "the best PSF": _best,
-    "the best PSF in a context": _best_in_context,
+    "the best PSF": _best("now"),
+    "the best PSF in a context": _best("all"),
     "the ends of an interpolation": _interpolated(None),
     "the ends of an interpolation in a context": _interpolated("all"),
     "all series": lambda archive, rng: archive.catalogue.series.all(OWNER),

@@ -43,10 +43,13 @@ class Missing(Exception):
 
 
 class Stack:
-    """A running service; ``workers`` are those that the test started itself (none when embedded)."""
+    """A running service; ``workers`` are those that the test started itself (none when embedded).
 
-    def __init__(self, data: Path, environment: dict[str, str]) -> None:
-        self.data = data
+    working: the working folder of the server, from which it must import nothing; None: that of the tests.
+    """
+
+    def __init__(self, data: Path, environment: dict[str, str], working: Path | None = None) -> None:
+        self.data, self.working = data, working
         self.environment = os.environ | QUICK | {"HELIOPSF_DATA_DIR": str(data)} | environment
         self.server: subprocess.Popen[str] | None = None
         self.workers: list[subprocess.Popen[str]] = []
@@ -57,8 +60,18 @@ class Stack:
         """Start the service at a port; 0: any free one. What it says is in ``server.out``, and its errors in ``server.log``."""
         folder = self.data.parent
         self.server = subprocess.Popen(
-            [sys.executable, "-m", "service.cli", "serve", "--port", str(port)],
+            [
+                sys.executable,
+                *(["-P"] if self.working else []),
+                "-m",
+                "service.cli",
+                "serve",
+                "--port",
+                str(port),
+            ],
             env=self.environment,
+            cwd=self.working,
+            umask=0o022,  # as usual
             stdout=(folder / "server.out").open("w"),
             stderr=(folder / "server.log").open("a"),
             text=True,
@@ -138,10 +151,10 @@ class Stack:
     def stop(self) -> None:
         """Stop everything by its process id; nothing may be left running."""
         started = self._all_processes()
-        for process in [*self.workers, *([self.server] if self.server else [])]:
-            if process.poll() is None:
-                process.send_signal(signal.SIGTERM)
-        for process in [*self.workers, *([self.server] if self.server else [])]:
+        own = [*self.workers, *([self.server] if self.server else [])]
+        for process in (one for one in own if one.poll() is None):
+            process.send_signal(signal.SIGTERM)
+        for process in own:
             try:
                 process.wait(40)
             except subprocess.TimeoutExpired:
@@ -158,19 +171,15 @@ class Stack:
 
     def _all_processes(self) -> list[psutil.Process]:
         running = [p for p in [*self.workers, self.server] if p is not None and p.poll() is None]
-        return [
-            c
-            for p in running
-            for c in (psutil.Process(p.pid), *psutil.Process(p.pid).children(recursive=True))
-        ]
+        roots = [psutil.Process(p.pid) for p in running]
+        return [p for root in roots for p in (root, *root.children(recursive=True))]
 
 
 @contextmanager
 def embedded(folder: Path, changes: dict[str, str] | None = None) -> Iterator[Stack]:
     """A service with its worker beside it, in one folder. changes: further environment variables."""
-    with _running(
-        Stack(folder / "data", {"HELIOPSF_BROKER_URL": "filesystem://"} | (changes or {}))
-    ) as stack:
+    broker = {"HELIOPSF_BROKER_URL": "filesystem://"}
+    with _running(Stack(folder / "data", broker | (changes or {}))) as stack:
         yield stack
 
 
@@ -238,17 +247,8 @@ class Redis:
         if binary is None:
             raise Missing("no redis-server on this machine")
         self._port = free_port()
-        self._command = [
-            binary,
-            "--bind",
-            "127.0.0.1",
-            "--port",
-            str(self._port),
-            "--save",
-            "",
-            "--dir",
-            str(folder),
-        ]
+        where = ["--bind", "127.0.0.1", "--port", str(self._port), "--dir", str(folder)]
+        self._command = [binary, *where, "--save", ""]
         self.url = f"redis://127.0.0.1:{self._port}/0"
 
     def __enter__(self) -> Redis:

@@ -1,4 +1,4 @@
-"""What a new user does with a real service: the curl lines of the documentation, Control-C, and a service that is restarted."""
+"""What a new user does with a real service: the curl lines of the documentation, Control-C, and commands over HTTP."""
 
 from __future__ import annotations
 
@@ -10,16 +10,13 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
-from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 from astropy.io import fits
 
-from service.client.http import Client
 from tests.conftest import REPOSITORY, write_image, write_psf
-from tests.whole import stack as stacks
 from tests.whole.stack import Stack, wait_for
 
 COMMAND = (sys.executable, "-m", "service.cli")
@@ -29,41 +26,16 @@ def test_the_service_says_what_to_open_in_a_browser(open_stack: Stack) -> None:
     assert open_stack.said().splitlines()[1] == f"Open {open_stack.client.server} in a browser."
 
 
-def rest_of(terminal: int) -> Iterator[str]:
-    """What is written to a terminal until its other end is closed."""
-    while True:
-        try:
-            yield os.read(terminal, 1000).decode()
-        except OSError:  # Linux's way to tell the end of a terminal
-            os.close(terminal)
-            return
-
-
-def started(stack: Stack, folder: Path) -> str:
-    """A job that takes so long that something can happen meanwhile, at work."""
-    write_image(folder / "large.fits", shape=(2048, 2048), OBSERVER=folder.name)
-    write_psf(folder / "large-psf.fits")
-    image = stack.client.upload_image(folder / "large.fits")["id"]
-    psf = stack.client.upload_psf(folder / "large-psf.fits")["id"]
-    method = {"name": "richardson-lucy", "steps": 200}
-    job: str = stack.client.submit("deconvolve", image_id=image, psf_id=psf, method=method)["id"]
-    wait_for(lambda: stack.client.job(job)["progress"]["step"] > 1, "the job is at work")
-    return job
-
-
 @pytest.mark.skipif(shutil.which("curl") is None, reason="curl is missing")
 def test_the_curl_lines_of_the_documentation_work(open_stack: Stack, tmp_path: Path) -> None:
     [lines] = re.findall(r"```sh\n(.+?)```", (REPOSITORY / "docs" / "http.md").read_text("utf-8"), flags=re.S)
     assert lines.count("curl ") == 6 and lines.startswith("S=http://127.0.0.1:8765 ")
     write_psf(tmp_path / "psf.fits", size=256)
-    psf = open_stack.client.upload_psf(
-        tmp_path / "psf.fits", instrument="hri_euv", channel="174", kind="total"
-    )
+    described = {"instrument": "hri_euv", "channel": "174", "kind": "total"}
+    psf = open_stack.client.upload_psf(tmp_path / "psf.fits", **described)
     times = {"valid_from": "2020-01-01", "valid_to": "2021-01-01"}  # not those of other tests' images
     open_stack.client.certify_psf(psf["id"], "1.0.0", **times)
-    open_stack.client.psf_curve(
-        psf["id"]
-    )  # makes the tables, which a PSF that the service builds has from the start
+    open_stack.client.psf_curve(psf["id"])  # makes the tables, which a built PSF has from the start
     write_image(
         tmp_path / "IMAGE.fits", DETECTOR="HRI_EUV", TELESCOP="SOLO/EUI/HRI_EUV", WAVELNTH=174.0,
         **{"DATE-BEG": "2020-05-05"},
@@ -82,7 +54,13 @@ def test_the_curl_lines_of_the_documentation_work(open_stack: Stack, tmp_path: P
 def test_control_c_leaves_the_job_and_the_commands_that_it_names_work(
     open_stack: Stack, tmp_path: Path
 ) -> None:
-    job = started(open_stack, tmp_path)
+    write_image(tmp_path / "large.fits", shape=(2048, 2048), OBSERVER=tmp_path.name)
+    write_psf(tmp_path / "psf.fits")
+    image = open_stack.client.upload_image(tmp_path / "large.fits")["id"]
+    psf = open_stack.client.upload_psf(tmp_path / "psf.fits")["id"]
+    method = {"name": "richardson-lucy", "steps": 200}
+    job: str = open_stack.client.submit("deconvolve", image_id=image, psf_id=psf, method=method)["id"]
+    wait_for(lambda: open_stack.client.job(job)["progress"]["step"] > 1, "the job is at work")
     address = open_stack.client.server.removeprefix("http://")
     terminal, other_end = pty.openpty()
     waiting = subprocess.Popen(
@@ -97,7 +75,12 @@ def test_control_c_leaves_the_job_and_the_commands_that_it_names_work(
     while b"deconvolving" not in shown:  # the bar: the command has begun to wait
         shown += os.read(terminal, 1000)
     waiting.send_signal(signal.SIGINT)
-    told = "".join(rest_of(terminal)).replace("\r\n", "\n")
+    rest = b""
+    with suppress(OSError):  # Linux's way to tell the end of a terminal
+        while True:
+            rest += os.read(terminal, 1000)
+    os.close(terminal)
+    told = rest.decode().replace("\r\n", "\n")
     assert waiting.wait(60) == 130, told
     assert f"interrupted; job {job[:12]} goes on" in told and "Traceback" not in told
     assert open_stack.client.job(job)["phase"] == "EXECUTING"
@@ -110,26 +93,13 @@ def test_control_c_leaves_the_job_and_the_commands_that_it_names_work(
 
 
 @pytest.mark.slow
-def test_a_wait_survives_a_restart_of_the_service(tmp_path: Path) -> None:
-    with stacks.embedded(tmp_path) as stack:
-        job = stack.client.job(started(stack, tmp_path))
-        said: list[str] = []
-        ended: list[str] = []
-
-        def wait() -> None:
-            with Client(stack.client.server, say=said.append) as client:
-                ended.append(client.wait(job, timeout_s=170)["phase"])
-
-        waiter = threading.Thread(target=wait)
-        waiter.start()
-        assert stack.server is not None
-        port = stack.client.server.rpartition(":")[2]
-        stack.server.send_signal(signal.SIGTERM)
-        # The client may also say that the job waits in its queue.
-        wait_for(lambda: any("no answer" in line for line in said), "the client has noticed")
-        stack.server.wait(60)
-        stack.start_server(int(port))
-        waiter.join(170)
-        assert ended == ["COMPLETED"]
-        lost = next(n for n, line in enumerate(said) if "no answer" in line)
-        assert "the service answers again" in said[lost:]
+def test_the_command_line_over_http_and_local_agree(
+    open_stack: Stack, tmp_path: Path, psf_file: Path
+) -> None:
+    write_image(tmp_path / "image.fits", seed=7)
+    command = [sys.executable, "-m", "service.cli", "deconvolve", str(tmp_path / "image.fits")]
+    ways = {"remote": ["--server", open_stack.client.server], "local": ["--local"]}
+    for name, way in ways.items():
+        output = ["--psf", str(psf_file), "-o", str(tmp_path / f"{name}.fits")]
+        subprocess.run([*command, *output, *way], check=True)
+    assert (tmp_path / "remote.fits").read_bytes() == (tmp_path / "local.fits").read_bytes()

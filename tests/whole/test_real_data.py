@@ -7,17 +7,15 @@ from pathlib import Path
 import pytest
 from astropy.io import fits
 
-from service.client.http import ServiceError
 from tests.whole.stack import Stack
 
+pytestmark = pytest.mark.slow
 HRI = "data/real/eui/derived_hrieuv174_20220401T103005920_pseudolinear.fits"
 AIA = "data/real/aia/aia.lev1_euv_12s.2022-04-02T132423Z.304.image.fits"
 AIA_GZ = "data/real/aia/AIA20110319_105400_0171.fits.gz"  # binned 4 x 4
-SWAP = "data/real/other/swap_lv1_20110607_063329.fits.gz"
 TRACE = "data/real/other/trace_19980519_222143_171.fits.gz"
 
 
-@pytest.mark.slow
 def test_the_real_hri_image(open_stack: Stack, shared: Path, tmp_path: Path) -> None:
     output = tmp_path / "out.fits"
     product = open_stack.client.deconvolve(shared / HRI, output)
@@ -32,7 +30,6 @@ def test_the_real_hri_image(open_stack: Stack, shared: Path, tmp_path: Path) -> 
         assert sunpy_map.fits_header[card] == before[card]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("name", "psf"), [(AIA, "aia_304"), (AIA_GZ, "aia_171"), (TRACE, "trace_171")])
 def test_real_images_need_no_option(
     open_stack: Stack, shared: Path, tmp_path: Path, name: str, psf: str
@@ -44,17 +41,3 @@ def test_real_images_need_no_option(
     assert dark is None if name == AIA_GZ else dark < 0
     assert product["details"]["bright_change_pct"] > 0
     assert fits.getheader(tmp_path / "out.fits")["PSFNAME"] == psf
-
-
-def test_images_of_other_telescopes_need_a_psf_of_theirs(
-    open_stack: Stack, shared: Path, tmp_path: Path, psf_file: Path
-) -> None:
-    psf_id = open_stack.client.upload_psf(psf_file)["id"]
-    for name in (SWAP,):
-        with pytest.raises(ServiceError) as refused:
-            open_stack.client.deconvolve(shared / name)
-        assert (refused.value.code, refused.value.status) == ("no-psf-for-instrument", 409), name
-        output = tmp_path / "out.fits"
-        product = open_stack.client.deconvolve(shared / name, output, psf_id=psf_id, steps=2, overwrite=True)
-        assert abs(product["details"]["flux_change_pct"]) < 1, name
-        assert len(fits.getheader(output)) > 50, name

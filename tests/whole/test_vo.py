@@ -9,15 +9,13 @@ import prov
 import pytest
 import requests
 from astropy.io import fits
-from pyvo.dal import DALQueryError
 from pyvo.dal.adhoc import DatalinkQuery, DatalinkResults
-from pyvo.dal.query import DALQuery, DALResults
-from pyvo.io.vosi import parse_availability, parse_capabilities, parse_tables
+from pyvo.dal.query import DALResults
 
 from service.client.http import Client
 from tests.conftest import write_image, write_psf
 from tests.service.vo.made import OBSERVED, WCS_CARDS
-from tests.whole.stack import Stack, wait_for
+from tests.whole.stack import Stack
 from workers.catalogue.access import Scope
 
 pytestmark = pytest.mark.slow
@@ -39,18 +37,6 @@ def session(keyed_stack: Stack, tmp_path_factory: pytest.TempPathFactory) -> req
     session = requests.Session()
     session.auth = ("anybody", key)
     return session
-
-
-def test_vosi_says_where_everything_is(keyed_stack: Stack) -> None:
-    base = f"{keyed_stack.client.server}/vo"
-    get = lambda name: io.BytesIO(requests.get(f"{base}/{name}", timeout=60).content)  # noqa: E731
-    wait_for(lambda: parse_availability(get("availability")).available, "the worker announces itself", 120)
-    found = {one.standardid: one for one in parse_capabilities(get("capabilities"))}
-    links = found["ivo://ivoa.net/std/DataLink#links-1.1"].interfaces[0]
-    assert links.accessurls[0].content == f"{base}/links"
-    assert links.securitymethods[0].standardid == "ivo://ivoa.net/sso#BasicAA"
-    tables = parse_tables(get("tables"))
-    assert {table.name for table in tables.iter_tables()} == {"products", "psfs"}
 
 
 def test_from_the_list_to_the_file_its_input_its_psf_and_its_provenance(
@@ -79,11 +65,3 @@ def test_from_the_list_to_the_file_its_input_its_psf_and_its_provenance(
     answer = session.get(cutout.queryurl, params=dict(cutout), timeout=60)
     with fits.open(io.BytesIO(answer.content)) as hdus:
         assert hdus[0].shape == (17, 17) and np.isfinite(hdus[0].data).all()
-
-
-def test_errors_reach_the_user(keyed_stack: Stack, session: requests.Session) -> None:
-    query = DALQuery(f"{keyed_stack.client.server}/vo/products", session=session, MAXREC="many")
-    with pytest.raises(DALQueryError, match="expected MAXREC, a whole number"):
-        query.execute()
-    anonymous = requests.get(f"{keyed_stack.client.server}/vo/products", timeout=60)
-    assert anonymous.status_code == 401 and "Basic" in anonymous.headers["WWW-Authenticate"]

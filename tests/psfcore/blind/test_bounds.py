@@ -29,16 +29,9 @@ def ideal(**left: float | tuple[float, float]) -> dict[str, Any]:
 
 
 def test_a_test_finds_an_effect_with_the_power_of_the_textbook_and_of_simulated_tests() -> None:
-    textbook = [
-        (1, 3.84, 0.5),
-        (1, 10.5, 0.9),
-        (1, 18.4, 0.99),
-        (18, 8.9, 0.5),
-        (18, 18.3, 0.9),
-        (18, 28.2, 0.99),
-    ]
-    for among, lam, probability in textbook:
-        assert excluded(lam, among) == pytest.approx(probability, abs=0.005), (among, lam)
+    for among, textbook in ((1, {3.84: 0.5, 10.5: 0.9, 18.4: 0.99}), (18, {8.9: 0.5, 18.3: 0.9, 28.2: 0.99})):
+        for lam, probability in textbook.items():
+            assert excluded(lam, among) == pytest.approx(probability, abs=0.005), (among, lam)
     rng = np.random.default_rng(3)
     score = np.sqrt(12.0) + rng.standard_normal(200_000)
     threshold = -np.quantile(rng.standard_normal(2_000_000), LEVEL / (2 * 5))

@@ -33,9 +33,9 @@ from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits
 from psfcore.gap import ideal_observer
 from psfcore.transit.folder import read_transit
-from tests.psfcore.gap.small_transits import effect
+from tests.psfcore.gap.small_gaps import effect
 
-SIZE_PX, IMAGES = 128, 9
+SIZE_PX, IMAGES = 96, 9
 LIMITS = FitsLimits(max_pixels=SIZE_PX**2)
 TWO = SetPlan(2, 3, SIZE_PX, IMAGES, only=("intensity_gradient", "saturation_fill"), built_diffraction=False)
 
@@ -162,7 +162,7 @@ def test_the_images_without_noise_are_kept_apart_from_the_transit(made: BlindSet
     chi2 = float(np.mean((noisy - mean) ** 2 / (np.array(variance) + rounded)))
     assert chi2 == pytest.approx(1.0, abs=0.02)
     change = mean - clean  # a plane, the same in all images
-    np.testing.assert_allclose(change, np.broadcast_to(change[0], change.shape), atol=2e-3)
+    np.testing.assert_allclose(change, np.broadcast_to(change[0], change.shape), atol=3e-3)
     assert np.abs(change).max() > 0.01
 
 

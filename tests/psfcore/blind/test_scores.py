@@ -100,16 +100,6 @@ def test_every_figure_of_the_answers_equals_the_one_computed_by_hand() -> None:
     assert true_closure(truth("clean")) is None
 
 
-def test_of_a_pair_only_the_effects_that_show_must_be_named() -> None:
-    said = report("attributed", "ghost")
-    pair = truth("pair", "ghost", "scene_evolution", left=4.0)
-    pair["effects"][0]["left_alone_pct"], pair["effects"][1]["left_alone_pct"] = 4.0, 0.1
-    contains = score([Judged(0, pair, said, 1.0)])["rows"][1]
-    assert (contains["n"], contains["value"]) == (1, 1.0)
-    pair["effects"][1]["left_alone_pct"] = 1.2
-    assert score([Judged(0, pair, said, 1.0)])["rows"][1]["value"] == 0.0
-
-
 def test_confusion_power_and_table_count_every_case_once() -> None:
     found = score(JUDGED)
     assert found["confusion"]["clean"] == {"none": 2, "inconclusive": 1, "ghost": 1}
@@ -209,14 +199,12 @@ def test_every_figure_of_the_sets_equals_the_one_computed_by_hand() -> None:
     assert set(rows) - set(FIGURES_OF_SETS) == set(COMPARED)
 
 
-LIGHT = {
-    "stage": "detector",
-    "map": {"x_px": [4.5, 14.5], "y_px": [4.5, 14.5]},
-}
-
-
 def light(*values: float) -> dict[str, Any]:
-    return LIGHT | {"map": LIGHT["map"] | {"value": np.reshape(values, (2, 2)).tolist()}}
+    at = [4.5, 14.5]
+    return {
+        "stage": "detector",
+        "map": {"x_px": at, "y_px": at, "value": np.reshape(values, (2, 2)).tolist()},
+    }
 
 
 def with_cause(kind: str, members: list[list[str]], *, chi2: float = 90.0, **unknown: Any) -> Judged:
@@ -258,23 +246,11 @@ def test_what_reports_tell_of_an_unknown_cause() -> None:
     agrees = np.corrcoef([0, 1, 2, 9], [9, 2, 1, 0])[0, 1]
     assert rows["map of light: correlation, median"]["value"] == pytest.approx((1 + agrees) / 2)
     assert cases[1].map == pytest.approx((np.hypot(10, 10) / 10, agrees))
-    assert [case.is_right_and_alone() for case in cases] == [
-        True,
-        False,
-        False,
-        True,
-        True,
-        False,
-        True,
-        False,
-    ]
+    assert [n for n, case in enumerate(cases) if case.is_right_and_alone()] == [0, 3, 4, 6]
     assert [required_causes(case.truth) for case in cases[3:5]] == [("unknown",), ("ghost", "unknown")]
     told = score(cases)["cases"][4]
-    assert (told["unknown"]["stage"], told["covered"], told["left_alone_chi2"]) == (
-        "detector",
-        True,
-        [90.0, 90.0],
-    )
+    assert told["unknown"]["stage"] == "detector" and told["covered"] is True
+    assert told["left_alone_chi2"] == [90.0, 90.0]
 
 
 def test_what_is_right_is_compared_with_what_could_be_known() -> None:
@@ -289,10 +265,8 @@ def test_what_is_right_is_compared_with_what_could_be_known() -> None:
         (COMPARED[1], 7, 3, alone[3:]),
         (COMPARED[2], 10, 2, alone),
     ):
-        assert (rows[figure]["n"], rows[figure]["value"]) == (
-            cases,
-            pytest.approx(right / math.fsum(known)),
-        ), figure
+        expected = pytest.approx(right / math.fsum(known))
+        assert (rows[figure]["n"], rows[figure]["value"]) == (cases, expected), figure
     low, high = wilson(3, 7)
     mean = math.fsum(alone[3:]) / 7
     assert rows[COMPARED[1]]["wilson95"] == pytest.approx((low / mean, high / mean))
@@ -301,38 +275,33 @@ def test_what_is_right_is_compared_with_what_could_be_known() -> None:
     assert (row["n"], row["value"], row["wilson95"]) == (1, None, None)
 
 
-def test_a_pair_whose_second_effect_is_not_seen_is_covered_by_the_first() -> None:
+def test_only_the_effects_that_show_must_be_named() -> None:
     pair = with_set("pair", ["ghost", "core_blur"], [["ghost"]], rival=400.0)
-    assert not pair.covers(("ghost",))
-    for effect, left in zip(pair.truth["effects"], (4.0, 0.9), strict=True):
-        effect["left_alone_pct"] = left
-    assert pair.covers(("ghost",)) and pair.is_right_and_alone()
-    assert pair.covers(("ghost", "core_blur"))
-    assert not pair.covers(("core_blur",))
-    pair.truth["effects"][0]["left_alone_pct"] = 0.9  # nothing is seen: both are required
-    assert not pair.covers(("ghost",))
+    pair.report.update(verdict="attributed", answer=["ghost"])
+    # Of two effects that show, or of which none shows, both are required.
+    for left, alone in (((4.0, 0.9), True), ((4.0, 1.2), False), ((0.9, 0.9), False)):
+        for effect, pct in zip(pair.truth["effects"], left, strict=True):
+            effect["left_alone_pct"] = pct
+        assert pair.covers(("ghost",)) == pair.is_right_and_alone() == alone, left
+        assert score([pair])["rows"][1]["value"] == float(alone)
+        assert pair.covers(("ghost", "core_blur")) and not pair.covers(("core_blur",))
     # Further effects cover the truth, but are not right.
     extra = with_set("single", ["ghost"], [["ghost", "persistence"]])
     assert extra.covers(("ghost", "persistence")) and not extra.is_right_and_alone()
 
 
-def test_the_score_tells_the_set_and_what_could_be_known() -> None:
+def test_the_score_tells_the_set_and_a_truth_without_a_residual_takes_that_of_the_ideal_observer() -> None:
     found = score(SETS)
     told = found["cases"]
     assert told[8]["set"] == [["ghost"], ["unknown"]]
     assert (told[8]["noncentrality"], told[8]["rival"]) == (400.0, 400.0)
     assert told[6]["ideal_alone"] is None
     assert COMPARED[0] in table(found)
-
-
-def test_a_truth_without_a_residual_takes_that_of_the_ideal_observer() -> None:
-    one = with_set("single", ["ghost"], [["ghost"]], rival=9.0)
-    del one.truth["left_after_refit_pct"]
-    assert one.left_pct == 2.5
-    unmeasured = with_set("single", ["ghost"], [["ghost"]])
-    del unmeasured.truth["left_after_refit_pct"]
-    assert math.isnan(unmeasured.left_pct)
-    assert score([unmeasured])["cases"][0]["left_after_refit_pct"] is None
+    for rival, left_pct in ((9.0, 2.5), (None, math.nan)):
+        one = with_set("single", ["ghost"], [["ghost"]], rival=rival)
+        del one.truth["left_after_refit_pct"]
+        assert one.left_pct == pytest.approx(left_pct, nan_ok=True)
+    assert score([one])["cases"][0]["left_after_refit_pct"] is None
 
 
 def test_a_verdict_is_right_if_it_states_the_truth_and_nothing_else() -> None:

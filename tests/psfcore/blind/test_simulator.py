@@ -19,9 +19,9 @@ from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits
 from psfcore.gap import ideal_observer
 from psfcore.transit.folder import read_transit
-from tests.psfcore.gap.small_transits import effect
+from tests.psfcore.gap.small_gaps import effect
 
-SIZE_PX, IMAGES = 128, 9
+SIZE_PX, IMAGES = 96, 9
 # A simulator that writes a transit of the tests.
 SMALL = """
     from tests.transit_files import write_transit
@@ -66,8 +66,14 @@ def test_the_example_of_the_documentation_makes_cases_that_an_ideal_observer_und
     assert case.known is not None and case.known.alone > 0.5
 
 
-def test_a_simulated_case_is_sealed_and_told_what_was_asked(tmp_path: Path) -> None:
+def test_a_simulated_case_is_sealed_and_told_what_was_asked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     source = source_in(tmp_path)
+    module = source_in(tmp_path, name="my_simulator_module.py")  # a module also works
+    monkeypatch.syspath_prepend(tmp_path)
+    assert simulator_of("my_simulator_module").__name__ == "make_case"
+    assert source_sha256("my_simulator_module") == source_sha256(module)
     made, failed = make_set(tmp_path / "set", plan_of(source))
     assert failed == {}
     truth = made.truth(0)
@@ -81,13 +87,6 @@ def test_a_simulated_case_is_sealed_and_told_what_was_asked(tmp_path: Path) -> N
     source_in(tmp_path, SMALL + "    # changed\n")
     with pytest.raises(DataError, match="other-set"):
         make_set(tmp_path / "set", plan_of(source, cases=4))
-
-
-def test_a_module_also_works(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = source_in(tmp_path, name="my_simulator_module.py")
-    monkeypatch.syspath_prepend(tmp_path)
-    assert simulator_of("my_simulator_module").__name__ == "make_case"
-    assert source_sha256("my_simulator_module") == source_sha256(path)
 
 
 def test_a_bad_simulator_is_refused_before_the_first_case(tmp_path: Path) -> None:
@@ -138,14 +137,8 @@ def test_a_truth_of_another_form_is_refused() -> None:
 
 
 def test_the_kind_follows_from_the_names() -> None:
-    kinds = {
-        (): "clean",
-        ("ghost",): "single",
-        ("ghost", "core_blur"): "pair",
-        ("my_glow",): "unknown",
-        ("ghost", "my_glow"): "mixed",
-        ("my_glow", "my_haze"): "unknown",
-    }
+    kinds = {(): "clean", ("ghost",): "single", ("ghost", "core_blur"): "pair", ("my_glow",): "unknown"}
+    kinds |= {("ghost", "my_glow"): "mixed", ("my_glow", "my_haze"): "unknown"}
     for names, kind in kinds.items():
         assert checked_truth("mine.py", {"effects": [{"name": name} for name in names]})["kind"] == kind
     # Effects with other names have a row in the confusion matrix.

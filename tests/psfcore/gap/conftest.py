@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from psfcore.gap.evidence.evidence import Evidence, gather
+from psfcore.gap.evidence.fields import FieldColumns
 from psfcore.scatter.inversion import invert
 from psfcore.scatter.reconstruction import Solution
 from psfcore.simulate.plan import default_plan
@@ -28,3 +29,9 @@ def solution(clean: Transit) -> Solution:
 @pytest.fixture(scope="session")
 def evidence(solution: Solution) -> Evidence:
     return gather(solution, FEW)
+
+
+@pytest.fixture(scope="session")
+def columns(evidence: Evidence) -> FieldColumns:
+    """The columns of the fields of the evidence, which do not depend on its residuals and effects."""
+    return FieldColumns(evidence)

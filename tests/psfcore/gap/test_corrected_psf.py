@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -13,31 +14,27 @@ from scipy.ndimage import gaussian_filter
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.psfs import read_psf, write_psf
-from psfcore.gap import corrected_psf as corrected_psfs
 from psfcore.gap.corrected_psf import corrected_psf
 from psfcore.gap.diagnose import Diagnosis, start_of
 from psfcore.gap.effect import Change, Effect
 from psfcore.gap.evidence.search import displaced
 from psfcore.gap.library.optics import DIRECTIONS, blur_as
 from psfcore.psf import Psf, cumulative_curve
-from psfcore.scatter import total_psf
 from psfcore.scatter.shapes import SHAPES
 from psfcore.scatter.total_psf import TotalPsf
 from psfcore.simulate.scatter_truth import ScatterTruth, total_kernel
-from tests.psfcore.gap.small_gaps import found
-from tests.psfcore.gap.small_transits import effect
+from tests.psfcore.gap.small_gaps import REACH_PX, effect, found, small_reach
 from tests.transit_files import TRUTH, diffraction
 
-REACH_PX = 513  # a smaller reach than usual, for less time and memory
 MIDDLE = REACH_PX // 2
 PARENTS = {"transit": "a" * 64, "report": "b" * 64}
 
 
 @pytest.fixture(autouse=True)
-def small_reach(monkeypatch: pytest.MonkeyPatch) -> None:
+def _with_small_reach() -> Iterator[None]:
     found()  # with the usual reach
-    for module in (corrected_psfs, total_psf):
-        monkeypatch.setattr(module, "REACH_GRID_PX", REACH_PX)
+    with small_reach():
+        yield
 
 
 def corrected(*effects: Effect, values: tuple[float, ...]) -> Psf:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -13,21 +12,22 @@ from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.linear_model import UNLIKELY
 from psfcore.gap.ideal_observer import IdealObserver, Left, ideal_observer, left_by_hypotheses
 from psfcore.simulate.plan import default_plan
-from psfcore.simulate.transit import simulate
+from psfcore.simulate.transit import SimulatedTransit, simulate
 from psfcore.transit.transit import Transit
 from tests.psfcore.gap.linear_models import FEW, dense, effect_of, with_left, with_residuals
+from tests.psfcore.gap.small_gaps import changed
 from tests.transit_files import TRUTH, diffraction
 
 
 @cache
+def simulated() -> SimulatedTransit:
+    return simulate(default_plan(9, 96, oversampling=1, brightness=4.0), TRUTH, diffraction(), seed=5)
+
+
 def expected(offset_dn: float = 0.0) -> Transit:
     """A transit without noise, with an offset of every readout."""
-    made = simulate(default_plan(9, 96, oversampling=1, brightness=4.0), TRUTH, diffraction(), seed=5)
-    frames = tuple(
-        replace(frame, pixels=(rate + offset_dn / frame.exposure_s).astype(np.float32))
-        for frame, rate in zip(made.transit.frames, made.sky.noise_free, strict=True)
-    )
-    return replace(made.transit, frames=frames)
+    rates = simulated().sky.noise_free
+    return changed(simulated().transit, lambda n, frame: rates[n] + offset_dn / frame.exposure_s)
 
 
 @cache

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from psfcore.gap.verdict.limits import ParameterLimits
-from psfcore.gap.verdict.posterior import NONE, PRIOR, UNKNOWN, Kind, Names
+from psfcore.gap.verdict.posterior import NONE, PRIOR, UNKNOWN, Kind
 from psfcore.gap.view import View
 from psfcore.scatter.reconstruction import Solution
 from psfcore.transit.transit import Transit
 from studies import gap_limits
-from studies.gap_calibration import KINDS, TEMPERATURES, Case, best_prior, calibrated, table
-from tests.psfcore.gap.small_transits import effect
+from studies.gap_calibration import KINDS, Case, best_prior, calibrated, table
+from tests.psfcore.gap.small_gaps import effect
 
 A, B, AB = ("a",), ("b",), ("a", "b")
 
@@ -34,23 +34,18 @@ def drawn_cases(count: int, temperature: float, prior: Mapping[Kind, float] = PR
 
 
 def test_the_true_share_is_that_of_a_hypothesis_with_all_effects() -> None:
-    def true_share(true: Names, shares: dict[Names, float]) -> float:
-        logs = {names: math.log(share) for names, share in shares.items()}
-        return Case(0, "single", true, logs).true_share(1.0)
-
     shares = {NONE: 0.2, UNKNOWN: 0.1, A: 0.3, AB: 0.4}
-    for true, share in {NONE: 0.2, UNKNOWN: 0.1, A: 0.4, AB: 0.4, B: 0.4}.items():
-        assert true_share(true, shares) == pytest.approx(share), true
     # A pair that the data do not show is counted to its effect; the second effect is then in no hypothesis.
     idle = {NONE: 0.2, UNKNOWN: 0.1, A: 0.6, AB: 0.1}
-    assert (true_share(A, idle), true_share(AB, idle)) == (pytest.approx(0.7), 0.0)
+    for weights, true, share in ((shares, B, 0.4), (shares, NONE, 0.2), (idle, A, 0.7), (idle, AB, 0.0)):
+        logs = {names: math.log(weight) for names, weight in weights.items()}
+        assert Case(0, "single", true, logs).true_share(1.0) == pytest.approx(share), (weights, true)
 
 
 def test_the_temperature_of_the_cases_is_found() -> None:
     for temperature in (1.0, 3.0):
         found = calibrated(drawn_cases(200, temperature), {"seed": 5})
         assert found.temperature == pytest.approx(temperature, rel=0.2)
-        assert TEMPERATURES[0] <= found.temperature <= TEMPERATURES[1]
         assert len(found.true_shares) == 200 and list(found.true_shares) == sorted(found.true_shares)
         assert found.about == {"seed": 5}
     # A case whose true cause was left out counts with a share of zero.
@@ -62,16 +57,12 @@ def test_the_temperature_of_the_cases_is_found() -> None:
 
 def test_the_table_of_the_calibration_has_coverage_and_size_of_every_kind() -> None:
     cases = drawn_cases(200, 2.0)
-    head, *rows = table(cases)
-    assert "true cause in the answer" in head and "mean size" in head
-    named = {row.split()[0]: row for row in rows}
+    named = {row.split()[0]: row for row in table(cases)[1:]}
     assert set(named) == {"clean", "single", "unknown", "all"} < {*KINDS, "all"}
-    every = named["all"]
-    low, high = (float(one) for one in every.split("(")[1].split(")")[0].split(" - "))
-    held, size, alone = (float(every.split()[at]) for at in (1, -2, -1))
+    low, high = (float(one) for one in named["all"].split("(")[1].split(")")[0].split(" - "))
+    held, size, alone = (float(named["all"].split()[at]) for at in (1, -2, -1))
     # Each half is tested with the calibration by the other one, so that the coverage holds.
     assert held == pytest.approx(0.9, abs=0.08) and low < held < high
-    assert every.split("), ")[1].split()[0] == "200"
     assert 1.0 <= size <= 4.0 and 0.0 < alone < held
     half = next(row for row in table(cases, 0.5)[1:] if row.startswith("all"))
     assert float(half.split()[-2]) < size
@@ -79,10 +70,10 @@ def test_the_table_of_the_calibration_has_coverage_and_size_of_every_kind() -> N
 
 def test_the_best_prior_is_the_one_from_which_the_truths_were_drawn() -> None:
     prior = dict(PRIOR) | {"single": 4.0 * PRIOR["single"], "unknown": 0.4 * PRIOR["unknown"]}
-    found = best_prior(drawn_cases(400, 1.0, prior), 1.0)
+    found = best_prior(drawn_cases(200, 1.0, prior), 1.0)
     assert sum(found.values()) == pytest.approx(1.0)
     for kind in ("single", "unknown"):
-        # Three times the scatter: with eight other seeds, the ratios of 400 draws scatter by 14 and 17 %.
+        # With other seeds, the ratios of 200 draws scatter by a quarter.
         assert found[kind] / found["none"] == pytest.approx(prior[kind] / prior["none"], rel=0.5)
 
 
@@ -106,7 +97,3 @@ def test_the_table_of_the_limits_counts_found_effects_and_truths_above_their_lim
     assert "1.00" in rows["core_blur"] and "0.00" in rows["core_blur"]
     assert "0.67" in rows["all"] and "0.33" in rows["all"] and "wide_halo" not in rows
     assert rows["not"] == "not added: wide_halo (untestable: no light)"
-    for found in (1, 3):  # the interval of a share contains it
-        four = [gap_limits.Case("ghost", "share", 0.01, n < found, 0.02, "ghost") for n in range(4)]
-        low, high = (float(one) for one in gap_limits.table(four)[1].split("(")[1].split(")")[0].split(" - "))
-        assert low < found / 4 < high

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import gc
-import weakref
 from copy import copy
 from dataclasses import replace
 
@@ -13,15 +11,14 @@ import psutil
 import pytest
 
 from psfcore.gap.view import View, return_unused_memory
-from tests.psfcore.gap.small_gaps import changed
-from tests.psfcore.gap.small_transits import clean, fit, solution
+from tests.psfcore.gap.small_gaps import changed, clean, fit, solution
 
 MIB = 2**20
 
 
 def test_a_scene_has_the_brightness_of_its_own_image() -> None:
     """The second image is 5 % brighter than the others of its pointing."""
-    transit = changed(clean(12), lambda n, frame: frame.pixels * (1.05 if n == 1 else 1.0))
+    transit = changed(clean(), lambda n, frame: frame.pixels * (1.05 if n == 1 else 1.0))
     view = View(fit(transit))
     of_one, of_next = (float(view.expected[n].mean() / transit.frames[n].pixels.mean()) for n in (1, 2))
     assert of_one == pytest.approx(of_next, rel=2e-3)
@@ -40,19 +37,6 @@ class Planes:
     def __init__(self, count: int) -> None:
         self.planes = [np.ones(MIB // 8) for _ in range(count)]
         self.own = self
-
-
-def test_objects_that_refer_to_each_other_are_freed() -> None:
-    gc.disable()
-    try:
-        planes = Planes(1)
-        alive = weakref.ref(planes)
-        del planes
-        assert alive() is not None
-        return_unused_memory()
-        assert alive() is None
-    finally:
-        gc.enable()
 
 
 @pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="the C library is not glibc")

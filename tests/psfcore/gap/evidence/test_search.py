@@ -25,8 +25,8 @@ from psfcore.scatter.total_psf import Blur
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.transit import simulate
 from psfcore.transit.occulter import coverage
-from psfcore.transit.transit import Transit
-from tests.psfcore.gap.small_transits import clean, effect, fit, solution, view
+from psfcore.transit.transit import Frame, Transit
+from tests.psfcore.gap.small_gaps import changed, clean, effect, fit, large, solution, view
 from tests.transit_files import TRUTH, diffraction
 
 Plane = NDArray[np.float64]
@@ -159,17 +159,16 @@ def test_a_wide_halo_is_found_at_about_its_width() -> None:
 
 def brightening(share: float) -> Transit:
     """A patch of the first pointing brightens by a share over its images; behind the occulter it does not show."""
-    transit = clean()
-    first = [frame for frame in transit.frames if frame.pointing == 1]
-    start, end = first[0].time_s, first[-1].time_s
+    transit = large()
+    times = [frame.time_s for frame in transit.frames if frame.pointing == 1]
     y, x = np.indices(transit.shape)
     patch = np.exp(-((y - 90) ** 2 + (x - 40) ** 2) / (2 * 15**2))
-    frames = []
-    for frame in transit.frames:
-        at = (frame.time_s - start) / (end - start) - 0.5 if frame.pointing == 1 else 0.0
-        seen = 1 + share * at * patch * (1 - coverage(transit.shape, frame.place))
-        frames.append(replace(frame, pixels=(frame.pixels * seen).astype(np.float32)))
-    return replace(transit, frames=tuple(frames))
+
+    def brighter(n: int, frame: Frame) -> np.ndarray:
+        at = (frame.time_s - times[0]) / (times[-1] - times[0]) - 0.5 if frame.pointing == 1 else 0.0
+        return frame.pixels * (1 + share * at * patch * (1 - coverage(transit.shape, frame.place)))
+
+    return changed(transit, brighter)
 
 
 def test_a_changing_sun_shows_only_in_the_unocculted_field() -> None:
@@ -187,29 +186,21 @@ def test_a_changing_sun_shows_only_in_the_unocculted_field() -> None:
 
 
 def test_templates_that_explain_the_data_equally_well_are_not_distinguished() -> None:
-    assert distinguished(np.array([3.0, 3.0, 3.0])) == pytest.approx(1.0)
-    assert distinguished(np.array([80.0, 0.0, 0.0, 0.0])) == pytest.approx(4.0)
-    assert distinguished(np.array([80.0, 80.0, 0.0, 0.0])) == pytest.approx(2.0)
-    assert distinguished(np.array([7.0])) == pytest.approx(1.0)
+    for gains, number in (([3, 3, 3], 1.0), ([80, 0, 0, 0], 4.0), ([80, 80, 0, 0], 2.0), ([7], 1.0)):
+        assert distinguished(np.array(gains, dtype=float)) == pytest.approx(number), gains
 
 
 def test_a_copy_is_found_at_its_place_with_its_blur() -> None:
-    dx, dy = 24, 16
-    frames = tuple(
-        replace(f, pixels=f.pixels + 0.06 * displaced(gaussian_filter(f.pixels, 8.0), dx, dy))
-        for f in clean(12).frames
+    transit = changed(
+        clean(), lambda n, f: f.pixels + 0.06 * displaced(gaussian_filter(f.pixels, 8.0), 24, 16)
     )
-    blur_px, x, y = place_search(View(fit(replace(clean(12), frames=frames)))).copy
-    assert (x, y) == pytest.approx((dx, dy), abs=4) and blur_px in (4.0, 8.0)
+    blur_px, x, y = place_search(View(fit(transit))).copy
+    assert (x, y) == pytest.approx((24, 16), abs=4) and blur_px in (4.0, 8.0)
 
 
 def test_the_direction_of_a_directional_blur_is_found() -> None:
     """The discs' means hardly show it, but their outermost cells do."""
-    frames = tuple(
-        replace(f, pixels=along_line(f.pixels.astype(np.float64)).astype(np.float32))
-        for f in clean(12).frames
-    )
-    seen = View(fit(replace(clean(12), frames=frames)))
+    seen = View(fit(changed(clean(), lambda n, f: along_line(f.pixels.astype(np.float64)))))
     (found,) = effect("core_blur").changes(seen)
     first = found.change(0, seen.expected)
     (same,) = [

@@ -18,7 +18,7 @@ from psfcore.gap.effect_sources import sha256_of_source
 from psfcore.gap.evidence.evidence import gather
 from psfcore.gap.library.registry import LIBRARY, added_effects, library_with
 from tests.gap_files import EDGE_GLOW as GLOW
-from tests.psfcore.gap.small_transits import solution, view
+from tests.psfcore.gap.small_gaps import solution, view
 
 DOCUMENTATION = Path(__file__).parents[4] / "docs" / "gap.md"
 

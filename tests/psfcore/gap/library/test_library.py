@@ -12,7 +12,7 @@ import pytest
 from psfcore.gap.evidence.unocculted_blocks import spread_blocks, unocculted_blocks
 from psfcore.gap.library.registry import LIBRARY
 from psfcore.gap.view import View
-from tests.psfcore.gap.small_transits import effect, solution, view
+from tests.psfcore.gap.small_gaps import effect, solution, view
 
 TEXT = (Path(__file__).parents[4] / "docs" / "gap.md").read_text("utf-8")
 # The list in the documentation: "The axes along which an effect can vary are ...".

@@ -28,30 +28,21 @@ SHARES: dict[str, dict[Names, float]] = {
 }
 LEAST = 0.06  # the probability that a hypothesis of the answer set needs
 HOLDS_FOR = "The coverage holds for transits like these."
+ABOUT = {"seed": 5, "version": "1.2.3", "command": "python -m made", "holds_for": HOLDS_FOR}
 
 
 def with_shares(shares: Mapping[Names, float], images: int = 12) -> Diagnosis:
     """The diagnosis as if these were the probabilities of the hypotheses."""
     logs = {names: math.log(share) for names, share in shares.items()}
-    calibration = Calibration(
-        1.0,
-        (LEAST,) * 19,
-        {"seed": 5, "version": "1.2.3", "command": "python -m made", "holds_for": HOLDS_FOR},
-    )
+    calibration = Calibration(1.0, (LEAST,) * 19, ABOUT)
     judgement = verdict_of(of_weights(logs), calibration, images=images)
     model = found().model
     refits = Refits(View(found().solution), model)
     told = unknown_fields(model, refits.columns, judgement.posterior) if UNKNOWN in judgement.members else ()
     fits = linear_fits(refits, model, judgement, told)
     shrinking = {form: found().shrinking.get(form, Shrinking(None, None, None)) for form in fits}
-    changed = replace(
-        found(),
-        judgement=judgement,
-        calibration=calibration,
-        fits=fits,
-        shrinking=shrinking,
-        unknown=told,
-    )
+    changed = replace(found(), judgement=judgement, calibration=calibration)
+    changed = replace(changed, fits=fits, shrinking=shrinking, unknown=told)
     answered = judgement.verdict in ("attributed", "tie")
     return changed if answered else replace(changed, corrected=(), residual_after=None)
 

@@ -22,14 +22,16 @@ from psfcore.gap.verdict.correction import Corrected, add_to_model, images_witho
 from psfcore.gap.verdict.posterior import with_same_data
 from psfcore.gap.view import View
 from psfcore.scatter.reconstruction import Solution
+from psfcore.simulate.plan import default_plan
+from psfcore.simulate.transit import simulate
 from psfcore.transit.transit import Frame, Transit
-from tests.psfcore.gap.small_gaps import changed
-from tests.psfcore.gap.small_transits import clean, effect, fit
+from tests.psfcore.gap.small_gaps import changed, clean, effect, fit
+from tests.transit_files import TRUTH, diffraction
 
 
 def fit_of(change: Any, effects: Sequence[Effect]) -> tuple[Solution, LinearModel]:
     """The fit to twelve images that were changed, and its linear model."""
-    solution = fit(changed(clean(12), change))
+    solution = fit(changed(clean(), change))
     return solution, LinearModel(gather(solution, effects), FLOOR)
 
 
@@ -68,7 +70,7 @@ def test_a_round_that_leaves_more_than_the_previous_one_is_rejected(monkeypatch:
 def test_a_refit_of_several_rounds_computes_the_jacobian_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """A plane of light; the model at the refit is that of a new linear model of the images without this plane."""
     plane = effect("intensity_gradient")
-    x = np.indices(clean(12).shape)[1] / clean(12).shape[1] - 0.5
+    x = np.indices(clean().shape)[1] / clean().shape[1] - 0.5
     solution, model = fit_of(lambda n, frame: frame.pixels + 4.0 + 8.0 * x, [plane])
     gathered: list[Evidence] = []
 
@@ -134,7 +136,8 @@ def test_a_subtracted_effect_scales_with_the_brightness_of_the_image() -> None:
         return (frame.pixels + 0.4 * copied(0, [frame.pixels])) * (1 + 0.02 * rng.standard_normal())
 
     copy = replace(effect("ghost"), changes=lambda view: [Change(copied, unocculted=False)], held=None)
-    view = View(fit(changed(clean(12), with_copy)))
+    plan = default_plan(12, 128, oversampling=1, brightness=8.0)
+    view = View(fit(changed(simulate(plan, TRUTH, diffraction(), seed=3).transit, with_copy)))
     before = gather(view.solution, [copy], view=view)
     after = gather(fit(images_without(view.solution.transit, view, [copy], np.array([0.4]))), [copy])
     blocks = replace(after.unocculted, variance=before.unocculted.variance)

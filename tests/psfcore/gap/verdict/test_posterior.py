@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 
 from psfcore.gap.evidence.evidence import Evidence, gather
-from psfcore.gap.evidence.fields import Field
+from psfcore.gap.evidence.fields import Field, FieldColumns
 from psfcore.gap.evidence.linear_model import LinearModel
 from psfcore.gap.library.detector import EFFECTS
 from psfcore.gap.verdict.posterior import (
@@ -34,14 +34,14 @@ def strong_offset(evidence: Evidence) -> LinearModel:
     return replace(with_residuals(evidence, {"dark_offset": 300.0}), scale_error=0.1)
 
 
-def test_noise_alone_is_no_gap_and_an_offset_is_an_offset(evidence: Evidence) -> None:
+def test_noise_alone_is_no_gap_and_an_offset_is_an_offset(evidence: Evidence, columns: FieldColumns) -> None:
     clean = replace(with_residuals(evidence, {}, noise=0.5), scale_error=0.1)
     for model, best in ((clean, NONE), (with_residuals(evidence, {"dark_offset": 30.0}), OFFSET)):
-        found = without_idle(posterior(model).probabilities())
+        found = without_idle(posterior(model, columns).probabilities())
         assert next(iter(found)) == best
         assert sum(found.values()) == pytest.approx(1.0)
         assert UNKNOWN in found
-    weak = posterior(with_residuals(evidence, {"dark_offset": 3.0}))
+    weak = posterior(with_residuals(evidence, {"dark_offset": 3.0}), columns)
     assert max(weak.probabilities(3.0).values()) < max(weak.probabilities().values())  # a temperature
 
 

@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from psfcore.errors import DataError
-from psfcore.gap.evidence.evidence import gather
 from psfcore.gap.evidence.fields import LIKELY, Field, fields_of
-from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
 from psfcore.gap.verdict import refits as refitting
 from psfcore.gap.verdict.posterior import Form, posterior, without_idle
-from psfcore.gap.verdict.refits import Refits, settled_posterior
+from psfcore.gap.verdict.refits import Refits
 from psfcore.gap.view import View
 from studies import gap_calibration
-from tests.psfcore.gap.small_gaps import OFFSET_DN, changed, found
-from tests.psfcore.gap.small_transits import clean, effect, fit
+from tests.psfcore.gap.small_gaps import OFFSET_DN, found
 
 OFFSET, BOTH, BLUR = (
     Form(names) for names in (("dark_offset",), ("dark_offset", "core_blur"), ("core_blur",))
@@ -126,20 +122,3 @@ def test_a_field_is_refitted_as_an_effect() -> None:
     model = refits.model_with(Form((), field))
     likely = model.evidence.prior.likely[list(model.evidence.columns["unknown"])]
     assert np.all((likely >= LIKELY) & (likely <= 10 * LIKELY)) and np.ptp(likely) == 0
-
-
-@pytest.mark.slow  # test_settled.py has the fast case of a second effect
-def test_a_second_effect_is_found_in_the_discs_beside_one_of_the_unocculted_field() -> None:
-    """A gain mismatch, which the discs do not show, and a light leak, which only the discs show."""
-    x = np.indices(clean().shape)[1] / 128 - 0.5
-    transit = changed(
-        clean(), lambda n, f: (f.pixels + 6.0 + 20.0 * x) * (1.1 if f.gain_mode == "combined" else 1.0)
-    )
-    solution = fit(transit)
-    view = View(solution)
-    library = [effect(name) for name in ("gain_mismatch", "intensity_gradient", "dark_offset", "core_blur")]
-    model = replace(LinearModel(gather(solution, library, view=view), FLOOR), scale_error=0.1)
-    settled = settled_posterior(posterior(model), Refits(view, model).weighed)
-    shares = without_idle(settled.probabilities())
-    best = next(iter(shares))
-    assert set(best) == {"gain_mismatch", "intensity_gradient"} and shares[best] > 0.9

@@ -92,9 +92,7 @@ def test_the_form_that_a_report_refits_is_one_that_images_can_show() -> None:
         posterior=Posterior({form: weighed(log) for form, log in logs.items()}, (*A, *B)),
     )
     assert found.posterior.leading(AU) == Form(A, formless) and found.form(AU) == Form(A, spot)
-    assert found.form(BU) == Form(B), (
-        "without a field, because no field of the hypothesis has a change of the images"
-    )
+    assert found.form(BU) == Form(B), "no field of the hypothesis has a change of the images"
 
 
 def test_improbable_members_of_the_set_do_not_change_the_verdict() -> None:
@@ -139,9 +137,8 @@ def test_the_set_has_the_coverage_that_was_asked_for() -> None:
     for coverage, members in ((0.3, (A,)), (0.6, (A, B)), (0.9, (A, B, NONE))):
         found = verdict_of(shares, calibration, images=12, coverage=coverage)
         assert (found.coverage, found.members) == (coverage, members)
-    with pytest.raises(DataError) as refusal:
+    with pytest.raises(DataError, match="bad-coverage"):
         verdict_of(shares, calibration, images=12, coverage=0.95)
-    assert refusal.value.code == "bad-coverage"
     # The refits of all hypotheses that name effects failed.
     nothing = posterior_of({NONE: 0.3, UNKNOWN: 0.7})
     found = verdict_of(nothing, calibration, images=12)
@@ -167,9 +164,8 @@ def test_the_answer_holds_the_hypotheses_above_the_threshold() -> None:
     assert calibration.answer(shares, 0.5) == (A,)
     assert calibration.answer({A: 0.1, NONE: 0.08}, 0.05) == (A,)
     for coverage in (0.0, 1.0, 0.96, -1.0):
-        with pytest.raises(DataError, match=r"at most 0\.950, for which 19 ") as refusal:
+        with pytest.raises(DataError, match=r"bad-coverage: .* 0\.950"):
             calibration.threshold(coverage)
-        assert refusal.value.code == "bad-coverage"
     # At least the most probable hypothesis, also if every one is less probable than the threshold.
     sure = Calibration(1.0, (0.99,) * 19, {})
     for shares in ({A: 0.4, NONE: 0.35, UNKNOWN: 0.25}, {NONE: 0.98, A: 0.02}):
