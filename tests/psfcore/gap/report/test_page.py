@@ -182,6 +182,18 @@ def test_every_verdict_is_explained_on_its_page(verdict: str, blank: None) -> No
     assert said[name] == (", ".join(diagnosis.judgement.answer).replace("_", " ") or "none")
 
 
+def test_a_field_without_a_map_or_a_curve_is_told_in_words_alone(blank: None) -> None:
+    diagnosis = judged("unknown")
+    report = report_of(diagnosis)
+    drawn = "The most probable field of an unknown cause"
+    assert drawn in pictures(gap_page(diagnosis, report))
+    for field in report["unknown"]["fields"]:
+        field.pop("map", None)
+        field.pop("curve", None)
+    page = gap_page(diagnosis, report)
+    assert drawn not in pictures(page) and report["unknown"]["fields"][0]["form"] in text_of(page)
+
+
 def test_effects_that_the_data_cannot_tell_apart_are_listed(blank: None) -> None:
     assert "No two effects are closer than 3 sigma" in text_of(html())
     pair = Alike(OFFSET_BLUR, 1.4, "a series of exposure times")
