@@ -91,7 +91,7 @@ def page(
 
 
 def templates() -> dict[str, str]:
-    """The sources of all templates, by their names."""
+    """The sources of all templates, by their names. A file holds those of one subject; the line {# --- NAME --- #} begins each."""
     found: dict[str, str] = {}
     for file in files(__package__).joinpath("templates").iterdir():
         _, *parts = re.split(r"^\{# --- (\S+) --- #\}\n", file.read_text("utf-8"), flags=re.MULTILINE)
