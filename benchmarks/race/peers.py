@@ -3,7 +3,7 @@
     python -m benchmarks.race.peers [NAME ...] [--whole] [--rounds N] [--page FILE]
 
 All packages run in turn, each in a process and an environment of its own: `.venv-peers/NAME`, made if it is missing, with the
-numpy and scipy of constraints.txt. A time contains everything from the image in memory to the result in memory; each loop first
+numpy, scipy and astropy of constraints.txt. A time contains everything from the image in memory to the result in memory; each loop first
 runs for one step, so that compiling and planning are left out. The results are compared before a time is printed.
 
 By default the image has 2048 px and the PSF 4096 px, so that every package convolves linearly: zeros surround the image. Packages
@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import time
@@ -52,10 +53,11 @@ def python_of(requirement: str) -> str:
     folder = REPOSITORY / ".venv-peers" / requirement.partition("=")[0].rstrip(">")
     python, done = folder / "bin" / "python", folder / ".installed"
     if not done.is_file() or done.read_text("utf-8") != requirement:
-        subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
+        newer = os.environ.get("HELIOPSF_PEERS_PYTHON", sys.executable)
+        subprocess.run([newer, "-m", "venv", str(folder)], check=True)
         pip = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
         constraints = ["-c", str(REPOSITORY / "constraints.txt")]
-        subprocess.run([*pip, *constraints, "numpy", "scipy", requirement], check=True)
+        subprocess.run([*pip, *constraints, "numpy", "scipy", "astropy", requirement], check=True)
         done.write_text(requirement, "utf-8")
     return str(python)
 

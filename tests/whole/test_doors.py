@@ -62,6 +62,9 @@ def test_other_users_of_the_machine_read_no_file_of_the_service(server: Server, 
     assert sent.status_code == 201
     data, found = server.stack.data, {}
     for path in (data, *data.rglob("*")):
+        # Other tests put files of their own into the shared store.
+        if path.is_file() and "blobs" in path.parts and path.name != sent.json()["id"]:
+            continue
         with suppress(FileNotFoundError):  # other tests use the service too
             found[path] = path.stat().st_mode & 0o777
     assert any(path.name == sent.json()["id"] for path in found)

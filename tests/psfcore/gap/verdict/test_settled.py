@@ -87,7 +87,7 @@ ROWS: list[Row] = [
     # A pair keeps the evidence of its own refit: a later refit of one of its effects states a less exact one.
     (
         PAIR | {A: 39.0, B: 38.0, AB: 45.0},
-        {AB: {AB: 38.5}, B: {B: 38.0, AB: 90.0}},
+        {AB: {AB: 38.0}, B: {B: 38.0, AB: 90.0}},
         STRONG,
         [A, AB, B],
         {A},
