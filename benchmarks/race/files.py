@@ -2,10 +2,10 @@
 
     python -m benchmarks.race.files [NAME ...] [--whole] [--rounds N]
 
-The image and the PSF are those of `benchmarks.race.peers`, as FITS files. A script reads both with astropy (with sunpy for aiapy),
-runs the loop of the package, and writes the result with astropy. A time is that of the process, with its start and its imports; each
-process runs once before, so that kernels and compiled modules are kept. A line gives the time as a ratio to that of heliopsf in
-the same round. HELIOPSF_PEERS_PYTHON names another Python for the other packages, which may need a newer one.
+The image, the PSF and the environments are those of `benchmarks.race.peers`. A script reads both files with astropy, runs the loop of
+the package, and writes the result with astropy; `benchmarks.race.peers` compares the results. A time is that of the process, with its start and
+its imports; each process runs once before, so that kernels and compiled modules are kept. A line gives the time as a ratio to that of
+heliopsf in the same round.
 """
 
 from __future__ import annotations
@@ -67,6 +67,8 @@ def main() -> None:
             for name in names:
                 Path("out.fits").unlink(missing_ok=True)
                 took, peak_gib = measured_process(command_of(name, chosen.whole), environment)
+                if not Path("out.fits").is_file():
+                    raise SystemExit(f"expected {name} to write out.fits; it did not")
                 if number:
                     times[name].append(took)
                 print(f"round {number}: {name:<20}{took:8.1f} s {peak_gib:6.2f} GiB", flush=True)

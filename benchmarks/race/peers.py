@@ -3,7 +3,7 @@
     python -m benchmarks.race.peers [NAME ...] [--whole] [--rounds N] [--page FILE]
 
 All packages run in turn, each in a process and an environment of its own: `.venv-peers/NAME`, made if it is missing, with the
-numpy, scipy and astropy of constraints.txt. A time contains everything from the image in memory to the result in memory; each loop first
+numpy, scipy and astropy of constraints.txt. HELIOPSF_PEERS_PYTHON names another Python for them, which new packages may need. A time contains everything from the image in memory to the result in memory; each loop first
 runs for one step, so that compiling and planning are left out. The results are compared before a time is printed.
 
 By default the image has 2048 px and the PSF 4096 px, so that every package convolves linearly: zeros surround the image. Packages
@@ -52,13 +52,15 @@ def python_of(requirement: str) -> str:
         return sys.executable
     folder = REPOSITORY / ".venv-peers" / requirement.partition("=")[0].rstrip(">")
     python, done = folder / "bin" / "python", folder / ".installed"
-    if not done.is_file() or done.read_text("utf-8") != requirement:
-        newer = os.environ.get("HELIOPSF_PEERS_PYTHON", sys.executable)
-        subprocess.run([newer, "-m", "venv", str(folder)], check=True)
+    base = os.environ.get("HELIOPSF_PEERS_PYTHON", sys.executable)
+    packages = ["numpy", "scipy", "astropy", requirement]
+    content = " ".join([base, *packages])
+    if not done.is_file() or done.read_text("utf-8") != content:
+        subprocess.run([base, "-m", "venv", "--clear", str(folder)], check=True)
         pip = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
         constraints = ["-c", str(REPOSITORY / "constraints.txt")]
-        subprocess.run([*pip, *constraints, "numpy", "scipy", "astropy", requirement], check=True)
-        done.write_text(requirement, "utf-8")
+        subprocess.run([*pip, *constraints, *packages], check=True)
+        done.write_text(content, "utf-8")
     return str(python)
 
 

@@ -94,8 +94,11 @@ def templates() -> dict[str, str]:
     """The sources of all templates, by their names. A file holds those of one subject; the line {# --- NAME --- #} begins each."""
     found: dict[str, str] = {}
     for file in files(__package__).joinpath("templates").iterdir():
-        _, *parts = re.split(r"^\{# --- (\S+) --- #\}\n", file.read_text("utf-8"), flags=re.MULTILINE)
-        found |= zip(parts[::2], map(str.strip, parts[1::2]), strict=True)
+        before, *parts = re.split(r"^\{# --- (\S+) --- #\}\n", file.read_text("utf-8"), flags=re.MULTILINE)
+        names = parts[::2]
+        if before or len({*found, *names}) < len(found) + len(names):
+            raise ValueError(f"expected only templates, each with a name of its own, in {file.name}")
+        found |= zip(names, map(str.strip, parts[1::2]), strict=True)
     return found
 
 

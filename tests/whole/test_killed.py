@@ -46,7 +46,7 @@ def done(stack: Stack, bulk: dict[str, Any]) -> int:
     return int(stack.client.bulk(bulk["id"])["images"]["done"])
 
 
-@pytest.mark.slow  # tests/workers/run/test_until_idle.py has the fast case
+@pytest.mark.slow  # tests/workers/run/test_worker.py has the fast case
 def test_a_job_of_a_killed_worker_is_done_once_by_another(
     stack: Stack, tmp_path: Path, psf_file: Path
 ) -> None:

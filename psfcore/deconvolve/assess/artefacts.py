@@ -144,7 +144,7 @@ class NoiseLevels:
     @property
     def least(self) -> float:
         """The noise of no pixel is below this value."""
-        return max(self.smallest, float(self.levels.min(initial=np.inf)) if self.levels.size else 0.0)
+        return max(self.smallest, float(self.levels.min()) if self.levels.size else 0.0)
 
     def at(self, brightness: Plane) -> Plane:
         """The noise of pixels of this brightness."""

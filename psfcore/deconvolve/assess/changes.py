@@ -38,7 +38,7 @@ from psfcore.image import Image, MaskBit
 from psfcore.noise import Noise
 from psfcore.psf import Psf
 
-BLOCKS_PX = (1, 4, 8, 16, 32)
+BLOCKS_PX = (1, 4, 8, 16, 32)  # powers of 2
 TAILS_PCT = (5.0, 1.0, 0.1)
 CHANGE_PERCENTILES = (0.1, 1.0, 5.0, 25.0, 50.0, 75.0, 95.0, 99.0, 99.9)
 _LARGEST_PCT = 99.0
@@ -182,7 +182,8 @@ def block_means(plane: Plane, counted: Flags, block_px: int) -> Plane:
     Only blocks whose pixels are all counted are used.
     """
     whole = _in_blocks(counted, block_px).all(axis=(1, 3))
-    return np.asarray(_in_blocks(plane, block_px).mean(axis=(1, 3))[whole])
+    with np.errstate(invalid="ignore"):  # a block with infinite pixels is not whole
+        return np.asarray(_in_blocks(plane, block_px).mean(axis=(1, 3))[whole])
 
 
 def _in_blocks(plane: Any, block_px: int) -> Any:

@@ -35,6 +35,8 @@ def percentiles(values: NDArray[Any], levels: Sequence[float]) -> NDArray[np.flo
 
 def medians(values: Values, groups: Groups, count: int) -> NDArray[np.float64]:
     """The median of the values (n,) of each of `count` groups. groups: the number of the group of each value; none is empty."""
+    if count == 0:
+        return np.empty(0)
     sizes = np.bincount(groups, minlength=count)
     middles = [[(size - 1) // 2, size // 2] for size in sizes.tolist()]
     return np.array([pair.mean(dtype=np.float64) for pair, _ in _at_ranks(values, groups, middles)])
@@ -57,6 +59,7 @@ def _at_ranks(
     values: Values, groups: Groups, ranks: Sequence[Sequence[int]]
 ) -> list[tuple[Values, NDArray[np.int64]]]:
     """For each group: the values that stand at these ranks (from 0) of its sorted values, and how many of its values are smaller."""
+    values = values + np.float32(0)  # -0 becomes 0: equal values must have equal keys
     counts = np.zeros((len(ranks), _BINS), np.int64)
     _count(values, groups, counts)
     below = np.cumsum(counts, axis=1)

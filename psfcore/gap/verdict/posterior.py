@@ -59,7 +59,7 @@ FORM_OF_LIBRARY = 0.5  # weight of the form of the library, if an effect can als
 FIELDS_BESIDE = 3  # the most probable fields, which are weighed beside every effect
 
 # The data do not show a further effect if it makes a hypothesis less probable by this factor. In 144 simulated cases (thresholds of one
-# half for the other), the factors 0.2, 0.5 and 1 give sets of 6.0, 5.4 and 5.3 members that cover the true cause in 0.90, 0.89 and 0.88;
+# half for the other, prior probabilities before they were fitted anew), the factors 0.2, 0.5 and 1 give sets of 6.0, 5.4 and 5.3 members that cover the true cause in 0.90, 0.89 and 0.88;
 # 0.14, 0.21 and 0.22 of the sets are right and have one member; a known effect beside an unknown one is covered in 0.72, 0.67 and 0.56.
 IDLE = 0.5
 

@@ -10,7 +10,7 @@ from psfcore.deconvolve.assess.ranks import medians, parts_of_equal_size, percen
 RNG = np.random.default_rng(3)
 VALUES = {
     "smooth": RNG.normal(5.0, 40.0, 30_001),
-    "whole numbers": np.round(RNG.normal(0.0, 3.0, 20_000)) + 0.0,
+    "whole numbers": np.round(RNG.normal(0.0, 3.0, 20_000)),
     "all equal": np.full(1000, -2.5),
     "one": np.array([7.0]),
     "far apart": np.concatenate(
