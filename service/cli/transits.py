@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -31,7 +33,9 @@ from service.cli.options import (
     write_json,
     writes_files,
 )
+from service.cli.progress import Report as Progress
 from service.cli.progress import echo
+from service.client.operations import Operations
 from service.client.outputs import written
 from workers.contract.requests import GapDiagnose, Report
 
@@ -52,6 +56,23 @@ DIAGNOSE = (
 )
 # The ideal observer also runs in another process, because the blind set and the gap library share no code.
 IDEAL = (sys.executable, "-P", "-m", "psfcore.gap.ideal_observer", "{expected}", "{ideal}")
+
+
+@contextmanager
+def _reporting(
+    server: str | None, local: bool, json_file: Path | None, *, gap_effects: str = ""
+) -> Iterator[tuple[Operations, Path, Progress]]:
+    """A service, the file for the numbers of its report, and the function that shows its progress.
+
+    json_file: None: the file is temporary. gap_effects: as in `connection`.
+    """
+    with (
+        user_errors(),
+        TemporaryDirectory(prefix="heliopsf-") as folder,
+        connection(server, local, gap_effects=gap_effects) as service,
+        progress_bar() as say,
+    ):
+        yield service, json_file or Path(folder) / "report.json", say
 
 
 @click.command()
@@ -88,13 +109,7 @@ def report(
         raise click.UsageError(
             "--shapes fits every shape to TRANSIT, so it cannot be used with --psf: remove one of the two"
         )
-    with (
-        user_errors(),
-        TemporaryDirectory(prefix="heliopsf-") as folder,
-        connection(server, local) as service,
-        progress_bar() as say,
-    ):
-        numbers = json_file or Path(folder) / "report.json"
+    with _reporting(server, local, json_file) as (service, numbers, say):
         found = service.report(
             transit,
             numbers,
@@ -183,13 +198,7 @@ def diagnose(
         raise click.UsageError(
             "--effects: expected --local with it; a service tests the effects in HELIOPSF_GAP_EFFECTS"
         )
-    with (
-        user_errors(),
-        TemporaryDirectory(prefix="heliopsf-") as folder,
-        connection(server, local, gap_effects=effects or "") as service,
-        progress_bar() as say,
-    ):
-        numbers = json_file or Path(folder) / "report.json"
+    with _reporting(server, local, json_file, gap_effects=effects or "") as (service, numbers, say):
         found = service.diagnose_gap(
             transit,
             numbers,
