@@ -20,26 +20,25 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from astropy.io import fits
 
-from benchmarks.race.peers import RACES, REPOSITORY, STEPS, python_of
+from benchmarks.race.peers import CONTENDERS, RACES, REPOSITORY, STEPS, python_of
 from benchmarks.timing import measured_process
 
 NAMES = ("aiapy", "scikit-image", "JAX, compiled loop")
 CARDS = {"TELESCOP": "bench", "BUNIT": "DN/s", "XPOSURE": 1.0, "DATE-OBS": "2020-01-01T00:00:00"}
 
 
-def command_of(name: str, whole: bool) -> list[str]:
+def command_of(name: str) -> list[str]:
     """The process that deconvolves image.fits with psf.fits into out.fits."""
     if name == "heliopsf":
         words = ["deconvolve", "image.fits", "--psf", "psf.fits", "-o", "out.fits", "--local", "--overwrite"]
         return [sys.executable, "-m", "service.cli", *words, "--steps", str(STEPS), "--edges", "zero"]
-    python = python_of(RACES[False].contenders[name].requirement)
-    return [python, "-m", "benchmarks.race.files", "--one", name, *(["--whole"] if whole else [])]
+    return [python_of(CONTENDERS[name].requirement), "-m", "benchmarks.race.files", "--one", name]
 
 
 def run_one(name: str) -> None:
     """Read, deconvolve and write with one package, in the working folder."""
     image, psf = (np.asarray(fits.getdata(f"{part}.fits"), np.float32) for part in ("image", "psf"))
-    result = RACES[False].contenders[name].loop(image, psf, STEPS)[: image.shape[0], : image.shape[1]]
+    result = CONTENDERS[name].loop(image, psf, STEPS)[: image.shape[0], : image.shape[1]]
     fits.writeto("out.fits", result.astype(np.float32), fits.getheader("image.fits"), overwrite=True)
 
 
@@ -66,7 +65,7 @@ def main() -> None:
         for number in range(chosen.rounds + 1):
             for name in names:
                 Path("out.fits").unlink(missing_ok=True)
-                took, peak_gib = measured_process(command_of(name, chosen.whole), environment)
+                took, peak_gib = measured_process(command_of(name), environment)
                 if not Path("out.fits").is_file():
                     raise SystemExit(f"expected {name} to write out.fits; it did not")
                 if number:

@@ -3,8 +3,9 @@
     python -m benchmarks.race.peers [NAME ...] [--whole] [--rounds N] [--page FILE]
 
 All packages run in turn, each in a process and an environment of its own: `.venv-peers/NAME`, made if it is missing, with the
-numpy, scipy and astropy of constraints.txt. HELIOPSF_PEERS_PYTHON names another Python for them, which new packages may need. A time contains everything from the image in memory to the result in memory; each loop first
-runs for one step, so that compiling and planning are left out. The results are compared before a time is printed.
+numpy, scipy and astropy of constraints.txt. HELIOPSF_PEERS_PYTHON names another Python for them, which new packages may need. A time
+contains everything from the image in memory to the result in memory; each loop first runs for one step, so that compiling and planning
+are left out. The results are compared before a time is printed.
 
 By default the image has 2048 px and the PSF 4096 px, so that every package convolves linearly: zeros surround the image. Packages
 with a deconvolution run their own: heliopsf, scikit-image and aiapy. For the others, which have FFTs but no deconvolution, the

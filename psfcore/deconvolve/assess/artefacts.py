@@ -89,10 +89,7 @@ def find_artefacts(
     filled_before, filled_after = (filled(plane).astype(np.float32) for plane in (before, after))
     classes = classes_of(filled_before[counted])
     noise_after = noise_levels(filled_after, counted, classes)
-    noise_before = sigma
-    if noise_before is None:
-        levels = noise_levels(filled_before, counted, classes)
-        noise_before = lambda at: levels.at(filled_before[at])  # noqa: E731
+    noise_before = sigma or _estimated_noise(filled_before, counted, classes)
     holes = _holes(filled_before, filled_after, counted, noise_before)
     overshoots = _overshoots(filled_before, filled_after, counted, noise_before, peak_weight)
     extremes = counted & _new_extremes(filled_before, filled_after, noise_before, noise_after)
@@ -163,6 +160,12 @@ def noise_levels(pixels: Plane, counted: Flags, classes: BrightnessClasses) -> N
     smallest = 1e-6 * float(np.abs(pixels).max()) + np.finfo(float).tiny
     levels = 1.4826 * ranks.medians(second, classes.numbers, classes.centres.size)
     return NoiseLevels(classes.centres, levels, smallest)
+
+
+def _estimated_noise(pixels: Plane, counted: Flags, classes: BrightnessClasses) -> NoiseAt:
+    """The noise of pixels, estimated from the pixels themselves, as a function of their brightness."""
+    levels = noise_levels(pixels, counted, classes)
+    return lambda at: levels.at(pixels[at])
 
 
 def second_difference(plane: Plane) -> Plane:
