@@ -25,6 +25,7 @@ import queue
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -91,7 +92,6 @@ class Engine:
         self.row_blocks = -(-ny // BLOCK_ROWS)
         self.column_blocks = -(-(lx // 2 + 1) // LANES)
         self.lanes_shape = (self.row_blocks, nx, 2, LANES)
-        self._spectrum = aligned(self.column_blocks, self.row_blocks * BLOCK_ROWS, 2, LANES)
         self._pool = ThreadPoolExecutor(max(threads - 1, 1))
         self._scratch: queue.SimpleQueue[Scratch] = queue.SimpleQueue()
         for _ in range(threads):
@@ -99,11 +99,20 @@ class Engine:
             self._scratch.put(Scratch(buffer, aligned(LANES, 4, LANES)))
         self.transfer = self._transfer_function(kernel, first)
 
+    @cached_property
+    def _spectrum(self) -> Single:
+        """The spectrum of the field, in blocks of columns. It must be asked for before threads share it."""
+        return aligned(self.column_blocks, self.row_blocks * BLOCK_ROWS, 2, LANES)
+
+    def release(self) -> None:
+        """Give back the memory of the spectrum; the next transform takes it again."""
+        self.__dict__.pop("_spectrum", None)
+
     @property
     def nbytes(self) -> int:
-        """Memory that the engine holds between two calls, in bytes."""
+        """Memory that the engine holds between two deconvolutions, in bytes."""
         scratch = self.threads * max(self.row_plan.length, self.column_plan.length) * 2 * LANES * 4
-        return self.transfer.nbytes + self._spectrum.nbytes + scratch
+        return self.transfer.nbytes + scratch
 
     @property
     def symmetric(self) -> bool:
@@ -166,21 +175,19 @@ class Engine:
 
     def rows_forward(self, lanes: Single) -> None:
         """Transform the rows of a field into the spectrum."""
+        spectrum = self._spectrum
 
         def work(start: int, stop: int, scratch: Scratch) -> None:
-            _rows_forward(
-                lanes, self._spectrum, 0, scratch.buffer, scratch.corner, start, stop, *self.row_numbers
-            )
+            _rows_forward(lanes, spectrum, 0, scratch.buffer, scratch.corner, start, stop, *self.row_numbers)
 
         self.run(work, self.row_blocks)
 
     def rows_inverse(self, lanes: Single) -> None:
         """Transform the spectrum's rows back into a field."""
+        spectrum = self._spectrum
 
         def work(start: int, stop: int, scratch: Scratch) -> None:
-            _rows_inverse(
-                lanes, self._spectrum, scratch.buffer, scratch.corner, start, stop, *self.row_numbers
-            )
+            _rows_inverse(lanes, spectrum, scratch.buffer, scratch.corner, start, stop, *self.row_numbers)
 
         self.run(work, self.row_blocks)
 
@@ -196,9 +203,10 @@ class Engine:
         """
         kernel = _columns_real if transfer.shape[2] == 1 else _columns_complex
         sign = np.float32(-1.0 if conjugate else 1.0)
+        spectrum = self._spectrum
 
         def work(start: int, stop: int, scratch: Scratch) -> None:
-            kernel(self._spectrum, transfer, sign, scratch.buffer, start, stop, *self.column_plan.numbers)
+            kernel(spectrum, transfer, sign, scratch.buffer, start, stop, *self.column_plan.numbers)
 
         self.run(work, self.column_blocks)
 
@@ -208,11 +216,10 @@ class Engine:
         `work` gets the spectrum, the fields, `buffer` and `corner` of the thread's `Scratch`, the range of blocks, and
         `row_numbers`.
         """
+        spectrum = self._spectrum
 
         def part(start: int, stop: int, scratch: Scratch) -> Any:
-            return work(
-                self._spectrum, *fields, scratch.buffer, scratch.corner, start, stop, *self.row_numbers
-            )
+            return work(spectrum, *fields, scratch.buffer, scratch.corner, start, stop, *self.row_numbers)
 
         return self.run(part, self.row_blocks)
 

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion, uniform_filter
 from scipy.special import ndtri
 
-from psfcore.deconvolve.assess.artefacts import classes_of, filled, second_difference
+from psfcore.deconvolve.assess.artefacts import classes_of, filled, second_differences
 from psfcore.errors import DataError
 from psfcore.fits.cards import optional_text
 from psfcore.fits.header import known_instrument
@@ -156,7 +156,7 @@ def _transfer(pixels: Any, counted: Any, sigma: Any) -> tuple[float, float] | No
         return None
     members = [classes.numbers == number for number in range(classes.centres.size)]
     if sigma is None:
-        differences = np.abs(second_difference(pixels))[counted] / 6
+        differences = second_differences(pixels, counted)
         levels = [_mean_of_lowest(differences[part]) / _LOWEST_MEAN for part in members]
     else:
         levels = [float(np.median(sigma[counted][part])) for part in members]

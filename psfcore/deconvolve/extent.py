@@ -56,7 +56,7 @@ IMAGE_BYTES = 20.0  # the image and the result in float64, the mask, and a compa
 ERRORS_BYTES = 240.0  # further bytes for each pixel of the image, if errors are estimated
 PSF_BYTES = 8.0
 ASSESSED_BYTES = (
-    100.0  # for each pixel of an image: to measure the changes, and to draw the pictures of a product
+    35.0  # for each pixel of an image: to measure the changes, and to draw the pictures of a product
 )
 READ_BYTES = 25.0  # for each pixel of the image beyond the region that is deconvolved
 MIB = 2**20

@@ -148,6 +148,7 @@ class Problem:
         image, domain = self.image, self.domain
         domain.release()  # the iteration holds what it needs of the planes of the domain
         steps_done, because, chi2 = self._run(iteration)
+        self.engine.release()
         x = iteration.x
         pixels = domain.cut([(0, x)] if x.ndim == 2 else self.engine.row_blocks_of(x))
         flux_in, flux_out, negative_pixels = fluxes(image, pixels)

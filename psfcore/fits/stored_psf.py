@@ -34,17 +34,21 @@ _DROPPED = ("EXTEND", "CHECKSUM", "DATASUM", "DATAMIN", "DATAMAX", "DATAMEAN", "
 def check_is_psf(path: str | Path, summary: HeaderSummary, limits: FitsLimits) -> None:
     """Raise DataError if a file is not a PSF. The weights are read in a process of its own.
 
-    summary: the summary of the file's header. Codes: "image-as-psf" for a product; "psf-nonfinite", "psf-negative",
-    "psf-sum", "psf-not-centred", "psf-off-centre" for weights that no PSF can have; "unreadable-pixels"; and the codes of
-    HeaderError.
+    summary: the summary of the file's header. Codes: those of `check_no_product`; "psf-nonfinite", "psf-negative", "psf-sum",
+    "psf-not-centred", "psf-off-centre" for weights that no PSF can have; "unreadable-pixels"; and the codes of HeaderError.
     """
+    check_no_product(summary)
+    with open(os.devnull, "wb") as unused:
+        run_limited(read_weights, path, unused, pixels=math.prod(summary.shape), limits=asdict(limits))
+
+
+def check_no_product(summary: HeaderSummary) -> None:
+    """Raise DataError "image-as-psf" if the header says that a file is a deconvolved image."""
     if summary.content == PRODUCT:
         raise DataError(
             "image-as-psf",
             "expected a PSF; the header (PSFID) says that the file is a deconvolved image: name the file of a PSF",
         )
-    with open(os.devnull, "wb") as unused:
-        run_limited(read_weights, path, unused, pixels=math.prod(summary.shape), limits=asdict(limits))
 
 
 def read_weights(target: BinaryIO, *, path: str, limits: dict[str, int]) -> dict[str, Any]:

@@ -34,7 +34,7 @@ from psfcore.fits.frame import frame_of
 from psfcore.fits.header import HeaderSummary, check_not_deconvolved, optional_text, read_summary
 from psfcore.fits.observation import read_observation
 from psfcore.fits.psfs import read_psf, stated_id
-from psfcore.fits.stored_psf import check_is_psf
+from psfcore.fits.stored_psf import check_no_product
 from psfcore.gap.effect_sources import sha256_of_source
 from psfcore.instruments.model import parse_instrument
 from psfcore.instruments.unknown import channel_of, unknown_instrument
@@ -205,16 +205,17 @@ class Local(Operations):
         return {"id": transit.sha256}
 
     def upload_psf(self, path: str | Path, **described: Any) -> dict[str, Any]:
-        """Add a PSF. As in a service, a PSF that heliopsf made keeps its id. No command describes the PSF anew."""
+        """Add a PSF, and read it. As in a service, a PSF that heliopsf made keeps its id. No command describes the PSF anew."""
         assert not any(described.values())
         path = Path(path)
         summary = read_summary(path, LIMITS)
-        check_is_psf(path, summary, LIMITS)
+        check_no_product(summary)
         files = _Files(path)
         sha256 = sha256_of(path)
         identity = stated_id(path, LIMITS) or sha256
         used = UsedPsf(identity, *name_of_upload(summary, path.name, sha256), PsfStatus.DRAFT)
         self._psfs[identity] = _NamedPsf(path, files, sha256, summary, used)
+        self._psf(identity, parts=False)
         return {"id": identity}
 
     def psf_of_instrument(self, instrument: str) -> str:

@@ -31,9 +31,9 @@ the image increases this estimate, so it is an upper limit.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,7 +86,7 @@ def find_artefacts(
     estimated from the pixels.
     """
     # Single precision is accurate enough for these filters, and twice as fast.
-    filled_before, filled_after = (filled(plane).astype(np.float32) for plane in (before, after))
+    filled_before, filled_after = (filled(plane).astype(np.float32, copy=False) for plane in (before, after))
     classes = classes_of(filled_before[counted])
     noise_after = noise_levels(filled_after, counted, classes)
     noise_before = sigma or _estimated_noise(filled_before, counted, classes)
@@ -156,8 +156,8 @@ class NoiseLevels:
 
 def noise_levels(pixels: Plane, counted: Flags, classes: BrightnessClasses) -> NoiseLevels:
     """Upper limit of the noise of `pixels` [y, x], which must be finite."""
-    second = np.asarray(np.abs(second_difference(pixels))[counted] / 6, dtype=np.float32)
-    smallest = 1e-6 * float(np.abs(pixels).max()) + np.finfo(float).tiny
+    second = second_differences(pixels, counted).astype(np.float32, copy=False)
+    smallest = 1e-6 * max(float(pixels.max()), -float(pixels.min())) + np.finfo(float).tiny
     levels = 1.4826 * ranks.medians(second, classes.numbers, classes.centres.size)
     return NoiseLevels(classes.centres, levels, smallest)
 
@@ -168,16 +168,34 @@ def _estimated_noise(pixels: Plane, counted: Flags, classes: BrightnessClasses) 
     return lambda at: levels.at(pixels[at])
 
 
-def second_difference(plane: Plane) -> Plane:
-    """The second difference along both axes [y, x]; the plane is mirrored at its edges. Sums are in double precision."""
-    difference = np.empty_like(plane)
-    padded = np.pad(plane, 1, mode="symmetric")
-    for top in range(0, len(plane), _BLOCK_ROWS):  # blocks of rows stay in the cache
-        rows = difference[top : top + _BLOCK_ROWS]
-        block = padded[top : top + len(rows) + 2].astype(np.float64)
-        along_y = block[:-2] - 2 * block[1:-1] + block[2:]
-        rows[:] = along_y[:, :-2] - 2 * along_y[:, 1:-1] + along_y[:, 2:]
-    return difference
+def second_differences(plane: Plane, counted: Flags) -> Plane:
+    """The absolute second difference along both axes, divided by 6, of the counted pixels (n,); the plane is mirrored at its
+    edges. Sums are in double precision."""
+    differences = np.empty(np.count_nonzero(counted), plane.dtype)
+    first = 0
+    for rows, block in _blocks_with_rim(plane, 1, "symmetric"):
+        double = block.astype(np.float64)
+        along_y = double[:-2] - 2 * double[1:-1] + double[2:]
+        both = along_y[:, :-2] - 2 * along_y[:, 1:-1] + along_y[:, 2:]
+        chosen = np.abs(both[counted[rows]])
+        differences[first : first + chosen.size] = chosen / 6
+        first += chosen.size
+    return differences
+
+
+def row_blocks(count: int) -> Iterator[slice]:
+    """All rows [0, count) in blocks that stay in the processor's cache."""
+    for top in range(0, count, _BLOCK_ROWS):
+        yield slice(top, min(top + _BLOCK_ROWS, count))
+
+
+def _blocks_with_rim(
+    plane: Pixels, rim_px: int, rim: Literal["edge", "symmetric"]
+) -> Iterator[tuple[slice, Pixels]]:
+    """The blocks of `row_blocks`, and their pixels with a rim on all sides. rim: as the mode of `numpy.pad`."""
+    padded = np.pad(plane, rim_px, mode=rim)
+    for rows in row_blocks(len(plane)):
+        yield rows, padded[rows.start : rows.stop + 2 * rim_px]
 
 
 def ringing_pct(before: Plane, after: Plane, counted: Flags) -> tuple[float | None, int]:
@@ -194,7 +212,9 @@ def ringing_pct(before: Plane, after: Plane, counted: Flags) -> tuple[float | No
 
 def _holes(before: Plane, after: Plane, counted: Flags, noise_before: NoiseAt) -> Flags:
     """Find the counted pixels that fulfil Eq. (1)."""
-    holes = counted & (after < HOLE_SHARE * before)
+    holes = np.empty_like(counted)
+    for rows in row_blocks(len(before)):
+        holes[rows] = counted[rows] & (after[rows] < HOLE_SHARE * before[rows])
     places = np.nonzero(holes)
     holes[places] = before[places] > DETECTION_SIGMA * noise_before(places)
     return holes
@@ -204,7 +224,9 @@ def _overshoots(
     before: Plane, after: Plane, counted: Flags, noise_before: NoiseAt, peak_weight: float
 ) -> Flags:
     """Find the counted pixels that fulfil Eq. (2)."""
-    overshoots = counted & (after > before.astype(np.float64) / peak_weight)
+    overshoots = np.empty_like(counted)
+    for rows in row_blocks(len(before)):
+        overshoots[rows] = counted[rows] & (after[rows] > before[rows].astype(np.float64) / peak_weight)
     places = np.nonzero(overshoots)
     limit = (before[places] + DETECTION_SIGMA * noise_before(places)) / peak_weight
     overshoots[places] = after[places] > limit
@@ -214,20 +236,33 @@ def _overshoots(
 def _new_extremes(before: Plane, after: Plane, noise_before: NoiseAt, noise_after: NoiseLevels) -> Flags:
     """Find the pixels that fulfil Eq. (3)."""
     extremes = np.zeros(after.shape, dtype=np.bool_)
-    # A median lies between the minimum and the maximum of its pixels. If a pixel differs from both by less than the
-    # limit, it cannot fulfil Eq. (3). Medians are therefore needed only for the few remaining pixels.
-    for sign, nearest, farthest in ((1, _maxima, _minima), (-1, _minima, _maxima)):
-        away = sign * (after - farthest(after, 2))
-        # The noise is computed only where the smallest noise of all would not be enough. It is rounded differently: the factor.
-        places = np.nonzero((after == nearest(after, 1)) & (away > 0.999 * EXTREME_SIGMA * noise_after.least))
+    for sign, places in _peaks(before, after, noise_after).items():
         limit = EXTREME_SIGMA * noise_after.at(before[places])
-        left = away[places] > limit
-        places, limit = tuple(axis[left] for axis in places), limit[left]
         away_after = sign * (after[places] - _medians(after, places))
         away_before = sign * (before[places] - _medians(before, places))
         # A real peak or pit is also visible in the image before, except for the noise.
         extremes[places] |= (away_after > limit) & (away_before < noise_before(places))
     return extremes
+
+
+def _peaks(before: Plane, after: Plane, noise_after: NoiseLevels) -> dict[int, Places]:
+    """The pixels that may fulfil Eq. (3): with 1 those that are the largest of 3 x 3 px, with -1 the smallest ones.
+
+    A median lies between the minimum and the maximum of its pixels. If a pixel differs from both by less than the limit, it cannot
+    fulfil Eq. (3). Medians are therefore needed only for the few pixels that are left.
+    """
+    peaks: dict[int, list[Places]] = {1: [], -1: []}
+    for rows, block in _blocks_with_rim(after, 2, "edge"):
+        pixels, inner = block[2:-2, 2:-2], block[1:-1, 1:-1]
+        for sign, nearest, farthest in ((1, np.maximum, np.minimum), (-1, np.minimum, np.maximum)):
+            away = sign * (pixels - _within(block, 2, farthest))
+            # The noise is computed only where the smallest noise of all would not be enough. It is rounded differently: the factor.
+            y, x = np.nonzero(
+                (pixels == _within(inner, 1, nearest)) & (away > 0.999 * EXTREME_SIGMA * noise_after.least)
+            )
+            left = away[y, x] > EXTREME_SIGMA * noise_after.at(before[rows][y, x])
+            peaks[sign].append((y[left] + rows.start, x[left]))
+    return {sign: tuple(map(np.concatenate, zip(*of_sign, strict=True))) for sign, of_sign in peaks.items()}
 
 
 def _maxima(plane: Pixels, radius_px: int) -> Pixels:
@@ -241,15 +276,18 @@ def _minima(plane: Pixels, radius_px: int) -> Pixels:
 
 
 def _extremes(plane: Pixels, radius_px: int, chosen: np.ufunc) -> Pixels:
-    """As the filters of scipy.ndimage, but several times as fast: blocks of rows stay in the cache."""
-    # Repeated edge pixels do not change the extremes.
-    padded = np.pad(plane, radius_px, mode="edge")
+    """As the filters of scipy.ndimage, but several times as fast."""
     extremes = np.empty_like(plane)
-    for top in range(0, len(plane), _BLOCK_ROWS):
-        rows = extremes[top : top + _BLOCK_ROWS]
-        block = padded[top : top + len(rows) + 2 * radius_px]
-        rows[:] = _slid(_slid(block, radius_px, chosen).T, radius_px, chosen).T
+    for rows, block in _blocks_with_rim(
+        plane, radius_px, "edge"
+    ):  # repeated edge pixels do not change the extremes
+        extremes[rows] = _within(block, radius_px, chosen)
     return extremes
+
+
+def _within(block: Pixels, radius_px: int, chosen: np.ufunc) -> Pixels:
+    """Extremes of the square around each pixel of a block, without a rim of radius_px."""
+    return _slid(_slid(block, radius_px, chosen).T, radius_px, chosen).T
 
 
 def _slid(rows: Pixels, radius_px: int, chosen: np.ufunc) -> Pixels:

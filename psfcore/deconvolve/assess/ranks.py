@@ -18,18 +18,20 @@ from psfcore.compiled import compiled
 Values = NDArray[np.float32]
 Groups = NDArray[np.uint8]
 _BINS, _SHIFT = 1 << 16, 16
+_MINUS_ZERO = -(1 << 31)
 _LARGEST = float(np.finfo(np.float32).max)
 
 
 def percentiles(values: NDArray[Any], levels: Sequence[float]) -> NDArray[np.float64]:
     """The percentiles of values (n,), which must not be NaN, as `numpy.percentile` computes them, in single precision."""
-    single = np.asarray(np.clip(values, -_LARGEST, _LARGEST), dtype=np.float32)
+    with np.errstate(over="ignore"):
+        single = np.asarray(values, dtype=np.float32)
     place = (single.size - 1) * np.asarray(levels) / 100
     rank = place.astype(np.intp)
     ((found, _),) = _at_ranks(
         single, np.zeros(single.size, np.uint8), [[*rank, *np.minimum(rank + 1, single.size - 1)]]
     )
-    low, high = np.split(found.astype(np.float64), 2)
+    low, high = np.split(np.clip(found.astype(np.float64), -_LARGEST, _LARGEST), 2)
     return np.asarray(low + (high - low) * (place - rank))
 
 
@@ -59,7 +61,6 @@ def _at_ranks(
     values: Values, groups: Groups, ranks: Sequence[Sequence[int]]
 ) -> list[tuple[Values, NDArray[np.int64]]]:
     """For each group: the values that stand at these ranks (from 0) of its sorted values, and how many of its values are smaller."""
-    values = values + np.float32(0)  # -0 becomes 0: equal values must have equal keys
     counts = np.zeros((len(ranks), _BINS), np.int64)
     _count(values, groups, counts)
     below = np.cumsum(counts, axis=1)
@@ -87,7 +88,8 @@ def _at_ranks(
 
 @compiled()
 def _bin(bits: Any) -> Any:
-    """The bin of a value with these bits."""
+    """The bin of a value with these bits. -0 has the bin of 0: equal values must have equal keys."""
+    bits = 0 if bits == _MINUS_ZERO else bits
     return ((bits ^ ((bits >> 31) & 0x7FFFFFFF)) >> _SHIFT) + _BINS // 2
 
 

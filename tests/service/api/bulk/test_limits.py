@@ -105,7 +105,7 @@ def test_errors_of_the_whole_run_are_those_of_the_run(api: TestClient, archive: 
 @pytest.mark.parametrize(
     ("where", "limit", "code"),
     [
-        ("uploads", {"max_job_memory_mib": 420}, "too-much-memory"),
+        ("uploads", {"max_job_memory_mib": 410}, "too-much-memory"),
         ("files", {"max_job_s": 60.0}, "too-much-time"),
     ],
 )
