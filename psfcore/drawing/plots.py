@@ -19,7 +19,7 @@ from matplotlib.colors import Colormap, LinearSegmentedColormap, LogNorm, Normal
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.text import Text
-from matplotlib.ticker import FixedFormatter, FuncFormatter
+from matplotlib.ticker import FixedFormatter, FuncFormatter, MaxNLocator
 from numpy.typing import NDArray
 
 from psfcore.drawing.thumbnail import EUV_POINTS, NO_DATA, block_means
@@ -113,7 +113,7 @@ def points(colour: str, size: float) -> dict[str, Any]:
 
 def preview_png(before: Plane, after: Plane, path: str | Path, *, title: str, unit: str) -> None:
     """Write the figure of `preview_figure` as PNG."""
-    write_png(preview_figure(before, after, title=title, unit=unit), path, pil_kwargs={"compress_level": 3})
+    write_png(preview_figure(before, after, title=title, unit=unit), path, pil_kwargs={"compress_level": 1})
 
 
 def preview_figure(before: Plane, after: Plane, *, title: str, unit: str) -> Figure:
@@ -156,6 +156,7 @@ def draw_panels(
             extent=extent,
             interpolation="nearest",
         )
+        axes.locator_params(nbins=4)  # a preview is drawn for every product, and ticks take most of the time
         axes.set_title(panel.title, fontsize=11, color=INK, loc="left")
         axes.set_xlabel("x (px)")
         if index % 3 == 0:
@@ -270,6 +271,8 @@ def colourbar(figure: Figure, axes: Any, drawn: Any, *, beyond: str) -> None:
     width = 0.0085
     bar_axes = figure.add_axes((box.x1 + 0.006, box.y0, width, box.height))
     bar = figure.colorbar(drawn, cax=bar_axes, extend=beyond, extendfrac=0.02)
+    bar.locator = MaxNLocator(4)
+    bar.update_ticks()
     bar.outline.set_linewidth(0.5)
     bar_axes.tick_params(labelsize=8.5)
     axes.tick_params(labelsize=8.5)
