@@ -305,24 +305,38 @@ class Run:
 
 
 def one_run(race: Race, name: str, words: Sequence[str], folder: Path, f_s: float) -> Run:
-    """Run a package, and compare its result. Raises SystemExit if it deviates by more than the race allows."""
+    """Run a package, and compare its result."""
     contender = race.contenders[name]
     environment = {"PYTHONPATH": str(REPOSITORY), "JAX_PLATFORMS": "cpu"}
     found = answer_of(
         "benchmarks.race.peers", "--one", name, *words, python=python_of(contender.requirement), folder=folder,
         JAX_ENABLE_X64=str(int(contender.double)), **environment,
     )  # fmt: skip
-    result = np.load(folder / "result.npy")
+    apart = deviation(race, name, np.load(folder / "result.npy"), folder)
+    return Run(found["seconds"], found["peak_gib"], f_s, apart)
+
+
+def deviation(race: Race, name: str, result: np.ndarray, folder: Path) -> float:
+    """The deviation of a result from that of heliopsf, which runs first. Raises SystemExit if it is larger than the race allows."""
     if name == "heliopsf":
         np.save(folder / "heliopsf.npy", result)
-    expected = np.load(folder / ("flat.npy" if contender.flat_start else "heliopsf.npy"))
+    expected = np.load(folder / ("flat.npy" if race.contenders[name].flat_start else "heliopsf.npy"))
     inner = np.s_[race.edge_px : -race.edge_px, race.edge_px : -race.edge_px]
     apart = float(np.abs(result - expected)[inner].max() / expected[inner].max())
     if not apart <= race.agreement:
         raise SystemExit(
             f"expected results within {race.agreement:g} of the brightest pixel; {name}: {apart:.1e}"
         )
-    return Run(found["seconds"], found["peak_gib"], f_s, apart)
+    return apart
+
+
+def prepare(race: Race, folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    """The image and the PSF of a race; they are also written to the folder, with the result of SciPy's loop from a flat start."""
+    image, psf = race.data()
+    flat = scipy_fft(image, psf, STEPS, np.full_like(image, FLAT * image.max()))
+    for label, array in (("image", image), ("psf", psf), ("flat", flat[: len(image), : len(image)])):
+        np.save(folder / f"{label}.npy", array)
+    return image, psf
 
 
 def row(name: str, runs: Sequence[Run], ours: Sequence[Run]) -> str:
@@ -365,12 +379,7 @@ def main() -> None:
     runs: dict[str, list[Run]] = {name: [] for name in names}
     with TemporaryDirectory(prefix="heliopsf-peers-") as place:
         folder = Path(place)
-        image, psf = race.data()
-        flat = scipy_fft(image, psf, STEPS, np.full_like(image, FLAT * image.max()))[
-            : len(image), : len(image)
-        ]
-        for label, array in (("image", image), ("psf", psf), ("flat", flat)):
-            np.save(folder / f"{label}.npy", array)
+        prepare(race, folder)
         for number in range(chosen.rounds):
             f_s = reference()
             for name in names:
