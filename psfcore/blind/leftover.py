@@ -23,7 +23,7 @@ from psfcore.noise import Noise
 from psfcore.scatter.inversion import invert
 from psfcore.scatter.reconstruction import DARK_MARGIN_PX, Reconstruction, TransitScenes
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW
-from psfcore.scatter.total_psf import Blur, Optics, TotalPsf, pick
+from psfcore.scatter.total_psf import Blur, Optics, TotalPsf
 from psfcore.simulate.scatter_truth import ScatterTruth
 from psfcore.transit.occulter import fully_dark
 from psfcore.transit.transit import Frame, Transit
@@ -67,17 +67,19 @@ class LinearEstimator:
         self._residuals, expected = zip(*(clean.residual(n) for n in images), strict=True)
         self._jacobians = [np.array([clean.jacobian(n, slope) for slope in slopes]) for n in images]
         self._weights = [clean.weight(n, expected[n]) for n in images]
-        self._observed = [float(pick(sky.observed[n], sky.dark[n]).mean()) for n in images]
+        self._observed = [float(clean.observed(n).mean()) for n in images]
 
     def left(self, images: Sequence[Plane]) -> Left:
         """The residual that an effect leaves. images: all images with the effect [y, x], DN/s."""
-        optics, sky = self._clean.optics, self._clean.sky
-        observed = [optics.lanes(pixels) for pixels in images]
-        scenes = [
-            optics.invert(lanes, scene, steps=_WARM_STEPS)
-            for lanes, scene in zip(observed, sky.scenes, strict=True)
-        ]
-        changed = replace(self._clean, sky=replace(sky, observed=observed, scenes=scenes))
+        clean = self._clean
+        frames = (
+            replace(frame, pixels=pixels) for frame, pixels in zip(clean.transit.frames, images, strict=True)
+        )
+        transit = replace(clean.transit, frames=tuple(frames))
+        sky = replace(clean.sky, transit=transit, scenes=list(clean.sky.scenes))
+        for n in range(len(images)):
+            sky.improve(n, clean.optics, _WARM_STEPS)
+        changed = replace(clean, transit=transit, sky=sky)
         changes = [changed.residual(n)[0] - before for n, before in enumerate(self._residuals)]
         before_pct, after_pct = self._percent(changes), self._percent(self._refitted(changes))
         return Left(rms(before_pct), rms(after_pct), after_pct)

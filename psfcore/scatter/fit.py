@@ -282,7 +282,7 @@ def _free_shells(solution: Solution, seed: int, progress: Progress) -> ShellWeig
         distance = disc_distance(solution.transit.shape, solution.sky.found[n].place)[dark]
         parts.append(
             Equations(
-                observed=pick(solution.sky.observed[n], dark),
+                observed=solution.observed(n),
                 ring_sums=segment_sums(
                     diffract.field(diffracted), np.stack(dark, axis=1), segments, threads=solution.threads
                 ),

@@ -332,8 +332,8 @@ class _Solver:
 
     def _measure_one(self, model: _Model, n: int, kept: _Measured | None) -> _Measured:
         """Compute Eq. (1) for one image. If `kept` is given, reuse its weights and Jacobian; otherwise compute Eq. (3) and (4)."""
-        images, sky = model.images, self._sky
-        sky.scenes[n] = images.optics.invert(sky.observed[n], sky.scenes[n], steps=WARM_STEPS)  # step (d)
+        images = model.images
+        self._sky.improve(n, images.optics, WARM_STEPS)  # step (d)
         residual, expected = images.residual(n)  # step (f)
         if kept is not None:
             return replace(kept, residual=residual, expected=expected)

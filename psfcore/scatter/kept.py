@@ -139,7 +139,6 @@ def _solution(archive: NpzFile, transit: Transit, threads: int) -> Solution:
     every, lanes = range(len(transit.frames)), optics.engine.lanes_shape
     sky = TransitScenes(
         transit,
-        observed=[optics.lanes(frame.pixels) for frame in transit.frames],
         scenes=[_array(archive, f"scene-{n:04d}", np.float32, *lanes) for n in every],
         found=list(contents.found),
         dark=[_dark(archive, n, transit.shape) for n in every],

@@ -36,13 +36,13 @@ def labelled(progress: Progress, label: str) -> Progress:
 
 @dataclass(eq=False)
 class TransitScenes:
-    """All images of a transit, with their latest scenes and occulter positions.
+    """The latest scenes of all images of a transit, and the positions of their occulters.
 
-    Images and scenes are stored in the memory order of the convolution engine (see `psfcore.scatter.total_psf`).
+    Scenes are stored in the memory order of the convolution engine (see `psfcore.scatter.total_psf`). Images are not, because a
+    second copy of them would take a third of the memory of a fit.
     """
 
     transit: Transit
-    observed: list[Lanes]
     scenes: list[Lanes]
     found: list[FoundPlace] = field(default_factory=list)
     dark: list[Pixels] = field(default_factory=list)
@@ -50,12 +50,16 @@ class TransitScenes:
     @classmethod
     def reconstructed(cls, transit: Transit, optics: Optics, progress: Progress) -> TransitScenes:
         """Step (d): the scenes of all images; no occulter is located yet."""
-        sky = cls(transit, [], [])
+        sky = cls(transit, [])
         for n, frame in enumerate(transit.frames):
             progress("reconstructing", n, len(transit.frames))
-            sky.observed.append(optics.lanes(frame.pixels))
-            sky.scenes.append(optics.invert(sky.observed[-1]))
+            sky.scenes.append(optics.invert(optics.lanes(frame.pixels)))
         return sky
+
+    def improve(self, n: int, optics: Optics, steps: int) -> None:
+        """Step (d) again: continue from the scene of image n for some steps."""
+        observed = optics.lanes(self.transit.frames[n].pixels)
+        self.scenes[n] = optics.invert(observed, self.scenes[n], steps=steps)
 
     def copy(self) -> TransitScenes:
         """A second object with the same contents. Arrays are shared, because no code writes to them."""
@@ -138,7 +142,11 @@ class Reconstruction:
     def residual(self, n: int) -> tuple[Vector, Vector]:
         """r of Eq. (1) for the dark pixels of image n, and the expected intensity of these pixels, DN/s."""
         expected = pick(self.optics.convolve(self.blanked_scene(n)), self.sky.dark[n])
-        return pick(self.sky.observed[n], self.sky.dark[n]) - expected, expected
+        return self.observed(n) - expected, expected
+
+    def observed(self, n: int) -> Vector:
+        """The intensity of the dark pixels of image n, DN/s."""
+        return self.transit.frames[n].pixels[self.sky.dark[n]].astype(np.float64)
 
     def weight(self, n: int, expected: Vector) -> Vector:
         """The inverse of the variance of Eq. (3) for the dark pixels of image n with the intensities `expected` (DN/s)."""

@@ -215,7 +215,7 @@ def exact_fit(
         progress("images held out", step, len(sample.held_out))
         if solution.transit.frames[n].file in left_out:
             continue
-        sky.scenes[n] = fitted.optics.invert(sky.observed[n], sky.scenes[n], steps=RESOLVE_STEPS)
+        sky.improve(n, fitted.optics, RESOLVE_STEPS)
         residual, expected = fitted.residual(n)
         held_out[n] = float(-100 * residual.mean() / (expected + residual).mean())
     shares = None
@@ -223,7 +223,7 @@ def exact_fit(
         # The last step of the fit changed the PSF by a negligible amount but did not update the scenes. Update them here.
         for step, n in enumerate(fitted.part):
             progress("settling", step, len(fitted.part))
-            sky.scenes[n] = fitted.optics.invert(sky.observed[n], sky.scenes[n], steps=SETTLE_STEPS)
+            sky.improve(n, fitted.optics, SETTLE_STEPS)
         shares = free_shares(fitted, at, progress=progress)
     return _fold_fit(sample, solution, at, held_out, shares)
 

@@ -221,7 +221,7 @@ def test_eq_4_is_what_a_change_of_the_psf_does() -> None:
 def expected_with(solution: Solution, n: int, at: NDArray[np.float64]) -> NDArray[np.float64]:
     """Expected intensity of the dark pixels of a frame for the PSF at these coordinates."""
     optics, dark = Optics(solution.total.kernel(at), solution.transit.shape), solution.sky.dark[n]
-    scene = optics.invert(solution.sky.observed[n], steps=10)
+    scene = optics.invert(optics.lanes(solution.transit.frames[n].pixels), steps=10)
     put(scene, dark, 0.0)
     return pick(optics.convolve(scene), dark)
 
