@@ -50,7 +50,7 @@ from psfcore.convolution.convolver import Convolver
 from psfcore.convolution.engine import BLOCK_ROWS, Engine
 from psfcore.convolution.fft_kernels import LANES
 from psfcore.deconvolve.assess.error_planes import sigma_points
-from psfcore.deconvolve.methods.linear import inverse_filter
+from psfcore.deconvolve.methods.linear import inverse_filter, solve_linear
 from psfcore.errors import DataError
 from psfcore.noise import Noise
 from psfcore.psf import CURVE_RADII_PX, REACH_GRID_PX, FittedShape, Psf, encircled_energy
@@ -209,12 +209,8 @@ class Optics(Blur):
 
     def invert(self, observed: Lanes, start: Lanes | None = None, *, steps: int = STEPS) -> Lanes:
         """The scene x of an observation, from `steps` iterations of Eq. (1). start: first estimate (default: observed)."""
-        x = observed.copy() if start is None else start.copy()
-        for _ in range(steps):
-            residual = self.convolve(x)
-            np.subtract(observed, residual, out=residual)
-            x += self.invert_once(residual)  # Eq. (1)
-        return x
+        first = observed if start is None else start
+        return solve_linear(self.engine, self._inverse, observed, first, steps)  # Eq. (1)
 
 
 def pick(lanes: Lanes, pixels: Pixels) -> NDArray[np.float64]:

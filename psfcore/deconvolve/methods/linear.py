@@ -41,7 +41,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.compiled import compiled
-from psfcore.convolution.engine import Engine, buffer_from_spectrum, spectrum_from_buffer
+from psfcore.convolution.engine import (
+    BLOCK_ROWS,
+    Engine,
+    Single,
+    buffer_from_spectrum,
+    spectrum_from_buffer,
+)
 from psfcore.convolution.fft_kernels import LANES, forward, inverse
 from psfcore.deconvolve.conditions import Conditions, Deconvolved
 from psfcore.deconvolve.problem import (
@@ -110,12 +116,36 @@ class Additive(LinearIteration):
 
     def measure(self) -> None:
         self.engine.columns(adjoint=False)
-        self.engine.row_stage(_residual_rows, self.observed, *self.judgement.numbers)
+        self.engine.row_stage(_residual_rows, self.observed, *self.judgement.numbers, _all_rows(self.engine))
 
     def update(self, *, last: bool) -> None:
         self.engine.multiply_columns(self._step_filter)
-        self.engine.row_stage(_add_rows, self.x, not last, self.moved, self.total)
+        self.engine.row_stage(_add_rows, self.x, not last, self.moved, self.total, _all_rows(self.engine))
         self.change = relative_change(self.moved.sum(), self.total.sum())
+
+
+def _all_rows(engine: Engine) -> int:
+    """The number of rows of a field with those that complete its last block."""
+    return engine.row_blocks * BLOCK_ROWS
+
+
+def solve_linear(
+    engine: Engine, step_filter: NDArray[np.float32], observed: Single, start: Single, steps: int
+) -> Single:
+    """x after some steps of Eq. (1), for an observation whose pixels are all trusted; in the engine's layout.
+
+    start: the first estimate. The scene is dark beyond the edges of the field. step_filter: as for `Additive`.
+    """
+    x, rows = start.copy(), engine.field_shape[0]
+    moved, total, sums = np.zeros((3, engine.row_blocks))
+    none = np.zeros((engine.row_blocks, 2, LANES), np.float32)  # no pixel is judged
+    engine.rows_forward(x)
+    for left in reversed(range(steps)):
+        engine.columns(adjoint=False)
+        engine.row_stage(_residual_rows, observed, none, 0, 0, np.float32(0), np.float32(1), sums, rows)
+        engine.multiply_columns(step_filter)
+        engine.row_stage(_add_rows, x, left > 0, moved, total, rows)
+    return x
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,8 +181,11 @@ def noise_amplification(
 
 
 @compiled(fastmath={"contract", "reassoc"})
-def _residual_rows(spectrum, observed, judged, first, last, slope, ground, sums, buffer, corner, start, stop, length, passes, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Replace H x by w (y - H x), where y is NaN if w is 0. Add up (y - H x)^2 / variance over the judged pixels."""
+def _residual_rows(spectrum, observed, judged, first, last, slope, ground, sums, rows, buffer, corner, start, stop, length, passes, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Replace H x by w (y - H x), where y is NaN if w is 0. Add up (y - H x)^2 / variance over the judged pixels.
+
+    The result is 0 beyond the number of rows.
+    """
     nx = observed.shape[1]
     zero, least = np.float32(0.0), np.float32(1e-30)
     z = buffer.reshape((-1, 2, LANES))
@@ -172,14 +205,15 @@ def _residual_rows(spectrum, observed, judged, first, last, slope, ground, sums,
             if first <= i < last:
                 sum_here += sum_row
         sums[block] = sum_here
+        _clear_beyond(z, rows - block * 2 * LANES, nx)
         buffer[nx * 2 * LANES : length * 2 * LANES] = zero
         forward(buffer, length, passes, lengths, tw, offsets)
         spectrum_from_buffer(spectrum, buffer, corner, block, length, place)
 
 
 @compiled(fastmath={"contract", "reassoc"})
-def _add_rows(spectrum, x, again, moved, total, buffer, corner, start, stop, length, passes, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Compute x <- x + G w (y - H x), Eq. (1). Add up (change)^2 and x^2 for each block."""
+def _add_rows(spectrum, x, again, moved, total, rows, buffer, corner, start, stop, length, passes, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Compute x <- x + G w (y - H x), Eq. (1). Add up (change)^2 and x^2 for each block. x is 0 beyond the number of rows."""
     nx = x.shape[1]
     zero = np.float32(0.0)
     z = buffer.reshape((-1, 2, LANES))
@@ -200,7 +234,17 @@ def _add_rows(spectrum, x, again, moved, total, buffer, corner, start, stop, len
             moved_here += moved_row
             total_here += total_row
         moved[block], total[block] = moved_here, total_here
+        _clear_beyond(z, rows - block * 2 * LANES, nx)
+        _clear_beyond(x[block], rows - block * 2 * LANES, nx)
         if again:
             buffer[nx * 2 * LANES : length * 2 * LANES] = zero
             forward(buffer, length, passes, lengths, tw, offsets)
             spectrum_from_buffer(spectrum, buffer, corner, block, length, place)
+
+
+@compiled()
+def _clear_beyond(z, rows, nx):  # type: ignore[no-untyped-def]
+    """Set the rows of a block beyond the number of rows to 0."""
+    for row in range(max(rows, 0), 2 * LANES):
+        for i in range(nx):
+            z[i, row // LANES, row % LANES] = np.float32(0.0)
