@@ -56,7 +56,7 @@ def build_psf(
     mount_image: pixels of the mount's mask image [y, x], row 0 at the lowest y (see `psfcore.fits.images`).
     progress: called with (step, steps); it may raise to stop the work.
     Raises DataError "bad-size", "unknown-component", "bad-mount", or "bad-instrument-file" if the file describes an
-    instrument that needs too large arrays.
+    instrument that needs arrays that are too large.
     """
     if size % 2 or not SMALLEST_SIZE_PX <= size <= LARGEST_SIZE_PX:
         expected = f"an even size of {SMALLEST_SIZE_PX} to {LARGEST_SIZE_PX} px"
@@ -187,7 +187,7 @@ def _provenance(instrument: Instrument, notes: dict[str, Any]) -> dict[str, Any]
 
 
 def known_diffraction(instrument: str | None, *, threads: int = 1) -> Kernel:
-    """The diffraction PSF of a known instrument, as weights [y, x], for a transit whose transit.json names no file of it.
+    """The diffraction PSF of a known instrument, as weights [y, x], for a transit whose transit.json names no PSF file.
 
     Raises DataError "no-known-psf" if the instrument is not known.
     """
