@@ -50,7 +50,7 @@ def build_psf(
     """Compute the total PSF of `instrument`, with its components; its shape is (size, size).
 
     size: an even number from 64 to 4096 (px).
-    component: build only this component, one of component_names(); the result is then a PSF without components.
+    component: build only this component, such as "DIFFRACTION"; the result is then a PSF without components.
     parts: False: compute only what the total PSF needs, and return it without components. The kernel is the same bit for
     bit.
     mount_image: pixels of the mount's mask image [y, x], row 0 at the lowest y (see `psfcore.fits.images`).
@@ -62,7 +62,7 @@ def build_psf(
         expected = f"an even size of {SMALLEST_SIZE_PX} to {LARGEST_SIZE_PX} px"
         raise DataError("bad-size", f"expected {expected}; got {size}")
     check_workload(instrument, instrument.name)
-    available = component_names(instrument)
+    available = available_parts(instrument) + (() if instrument.scatter is None else (SCATTER,))
     if component not in (None, *available):
         raise DataError("unknown-component", f"expected one of {', '.join(available)}; got {component!r}")
     names = available if component is None else (component,)
@@ -143,11 +143,6 @@ def build_recipe(
             "software_version": software_version(),
         },
     )
-
-
-def component_names(instrument: Instrument) -> tuple[str, ...]:
-    """The names of the components that a PSF of this instrument has."""
-    return available_parts(instrument) + (() if instrument.scatter is None else (SCATTER,))
 
 
 def _on_full_reach(kernel: Kernel) -> tuple[Kernel, float]:
