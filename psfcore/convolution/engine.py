@@ -160,7 +160,7 @@ class Engine:
         return lanes
 
     def from_lanes(self, lanes: Single) -> Single:
-        """Convert from the engine's layout to a field, shape (ny, nx)."""
+        """The field [y, x] that an array in the engine's layout contains."""
         field = np.empty(self.field_shape, np.float32)
         for first, rows in self.row_blocks_of(lanes):
             field[first : first + len(rows)] = rows

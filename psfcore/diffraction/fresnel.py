@@ -126,7 +126,7 @@ def conic_sag_mm(x_mm: ArrayLike, *, radius_mm: float, conic: float) -> Vector:
 
 
 def mirror_transmission(mirror: Mirror, grid: Grid) -> Wave:
-    """The factor by which a mirror multiplies a field, shape (samples,): the phase of Eq. (2), and 0 outside the rim."""
+    """The factor by which a mirror multiplies a field: the phase of Eq. (2), and 0 outside the rim, (samples,)."""
     sign = 1.0 if mirror.figure == "convex" else -1.0
     radius_mm = mirror.diameter_mm / 2
     inside = open_share(grid, np.array([[-radius_mm, radius_mm]]))
@@ -164,7 +164,7 @@ def open_share(grid: Grid, openings_mm: Vector) -> Vector:
 
 
 def fraunhofer_field(openings_mm: Vector, grid: Grid, focal_length_mm: float) -> Wave:
-    """The field in focus of an evenly illuminated pupil, shape (samples,): the sum of the transforms of the openings.
+    """The field in focus of an evenly illuminated pupil: the sum of the transforms of the openings, (samples,).
 
     An opening of width w around c gives w sinc(pi w u) exp(-2 pi i c u), with u = x / (lambda f).
     """

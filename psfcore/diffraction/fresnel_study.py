@@ -278,7 +278,7 @@ def _combined_line(path: LightPath, entrance_line: Vector, distance_mm: float, w
 
 
 def _compared(wheel: _AtWheel, lines: Vector, combined: Vector) -> DistanceResult:
-    """Compute curves and differences from the lines of all phases, shape (phases, 2 REACH_PX + 1)."""
+    """The curves and differences that follow from the lines of all phases, (phases, 2 REACH_PX + 1)."""
     path = wheel.path
     radii_px = np.arange(REACH_PX)
     combined_beyond = 100 * line_light_beyond(combined, radii_px)
