@@ -50,19 +50,19 @@ def build_psf(
     """Compute the total PSF of `instrument`, with its components; its shape is (size, size).
 
     size: an even number from 64 to 4096 (px).
-    component: build only this component, one of component_names(); the result is then a PSF without components.
+    component: build only this component, such as "DIFFRACTION"; the result is then a PSF without components.
     parts: False: compute only what the total PSF needs, and return it without components. The kernel is the same bit for
     bit.
     mount_image: pixels of the mount's mask image [y, x], row 0 at the lowest y (see `psfcore.fits.images`).
     progress: called with (step, steps); it may raise to stop the work.
     Raises DataError "bad-size", "unknown-component", "bad-mount", or "bad-instrument-file" if the file describes an
-    instrument that needs too large arrays.
+    instrument that needs arrays that are too large.
     """
     if size % 2 or not SMALLEST_SIZE_PX <= size <= LARGEST_SIZE_PX:
         expected = f"an even size of {SMALLEST_SIZE_PX} to {LARGEST_SIZE_PX} px"
         raise DataError("bad-size", f"expected {expected}; got {size}")
     check_workload(instrument, instrument.name)
-    available = component_names(instrument)
+    available = available_parts(instrument) + (() if instrument.scatter is None else (SCATTER,))
     if component not in (None, *available):
         raise DataError("unknown-component", f"expected one of {', '.join(available)}; got {component!r}")
     names = available if component is None else (component,)
@@ -145,11 +145,6 @@ def build_recipe(
     )
 
 
-def component_names(instrument: Instrument) -> tuple[str, ...]:
-    """The names of the components that a PSF of this instrument has."""
-    return available_parts(instrument) + (() if instrument.scatter is None else (SCATTER,))
-
-
 def _on_full_reach(kernel: Kernel) -> tuple[Kernel, float]:
     """Scale the weights so that they sum to 1 on the full reach; also return the share of the light beyond the
     reach."""
@@ -187,7 +182,7 @@ def _provenance(instrument: Instrument, notes: dict[str, Any]) -> dict[str, Any]
 
 
 def known_diffraction(instrument: str | None, *, threads: int = 1) -> Kernel:
-    """The diffraction PSF of a known instrument, as weights [y, x], for a transit whose transit.json names no file of it.
+    """The diffraction PSF of a known instrument, as weights [y, x], for a transit whose transit.json names no PSF file.
 
     Raises DataError "no-known-psf" if the instrument is not known.
     """

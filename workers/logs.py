@@ -101,7 +101,7 @@ def _one_line(text: str) -> str:
 
 
 class RotatedFile(RotatingFileHandler):
-    """A log file of several processes: full, it is renamed to FILE.1, the file FILE.1 to FILE.2, and so on."""
+    """A log file that several processes share. When it is full, it is renamed to FILE.1, FILE.1 to FILE.2, and so on."""
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write the record, while no other process rotates the file."""

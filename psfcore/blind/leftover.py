@@ -85,7 +85,7 @@ class LinearEstimator:
         return Left(rms(before_pct), rms(after_pct), after_pct)
 
     def clean_left_pct(self) -> list[float]:
-        """e_i of Eq. (1) for every image without effects, after the refit, percent. The sampling on pixels causes it."""
+        """The residual of every image without effects after the refit, e_i of Eq. (1), percent: what sampling on pixels leaves."""
         return self._percent(self._refitted(self._residuals))
 
     def _refitted(self, residuals: Sequence[Vector]) -> list[Vector]:

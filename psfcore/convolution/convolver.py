@@ -60,13 +60,13 @@ class Convolver:
         self._transfer = scipy.fft.rfft2(corner, workers=threads)
 
     def apply(self, x: Field) -> Field:
-        """H x, Eq. (1): the field convolved with the PSF; shape (ny, nx)."""
+        """The field [y, x] convolved with the PSF, H x of Eq. (1)."""
         spectrum = self._forward(x)
         spectrum *= self._transfer
         return self._inverse(spectrum)
 
     def adjoint(self, y: Field) -> Field:
-        """H^T y, Eq. (2): the field correlated with the PSF; shape (ny, nx)."""
+        """The field [y, x] correlated with the PSF, H^T y of Eq. (2)."""
         spectrum = self._forward(y)
         # Compute spectrum * conj(transfer) without a temporary array for the conjugate.
         np.conjugate(spectrum, out=spectrum)
@@ -168,7 +168,7 @@ class ChirpTransform:
         self._transfer = scipy.fft.fft(kernel, overwrite_x=True)
 
     def apply(self, f: NDArray[np.complexfloating]) -> NDArray[np.complex128]:
-        """Compute F, shape (out_samples,), from f, shape (samples,). Raises DataError "field-shape"."""
+        """The transform F, (out_samples,), of a field f, (samples,). Raises DataError "field-shape"."""
         if f.shape != (self.samples,):
             raise DataError("field-shape", f"expected a field of {(self.samples,)}; got {f.shape}")
         spectrum = scipy.fft.fft(f * self._before, n=self._length, overwrite_x=True)

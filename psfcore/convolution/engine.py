@@ -122,11 +122,11 @@ class Engine:
     # Whole operators -------------------------------------------------------------------------------
 
     def apply(self, x: NDArray[np.floating]) -> Single:
-        """H x: the field convolved with the PSF; shape (ny, nx)."""
+        """The field [y, x] convolved with the PSF, H x."""
         return self._whole(x, adjoint=False)
 
     def adjoint(self, y: NDArray[np.floating]) -> Single:
-        """H^T y: the field correlated with the PSF; shape (ny, nx)."""
+        """The field [y, x] correlated with the PSF, H^T y."""
         return self._whole(y, adjoint=True)
 
     def _whole(self, field: NDArray[np.floating], *, adjoint: bool) -> Single:
@@ -160,7 +160,7 @@ class Engine:
         return lanes
 
     def from_lanes(self, lanes: Single) -> Single:
-        """Convert from the engine's layout to a field, shape (ny, nx)."""
+        """The field [y, x] that an array in the engine's layout contains."""
         field = np.empty(self.field_shape, np.float32)
         for first, rows in self.row_blocks_of(lanes):
             field[first : first + len(rows)] = rows
@@ -359,7 +359,10 @@ def spectrum_from_buffer(spectrum, buffer, corner, block, length, place):  # typ
 
 @compiled()
 def buffer_from_spectrum(spectrum, buffer, corner, block, length, place):  # type: ignore[no-untyped-def]
-    """Do the inverse of ``spectrum_from_buffer``: Z[k] = A[k] + i B[k], Z[L-k] = A*[k] + i B*[k]."""
+    """Join the spectra of 32 rows to a block that the inverse transform turns into these rows.
+
+    Z[k] = A[k] + i B[k] and Z[L-k] = A*[k] + i B*[k], the inverse of ``spectrum_from_buffer``.
+    """
     last = length // 2
     rows = spectrum.shape[1]
     for group in range(spectrum.shape[0]):

@@ -142,7 +142,7 @@ def split(_typing, z, corner, p, q, at):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def join(_typing, corner, z, at, p, q):  # type: ignore[no-untyped-def]
-    """Do the inverse of `split`: with A and B at corner[at], A + i B goes to z[p], and A* + i B* to z[q]."""
+    """Join the numbers A and B at corner[at], the inverse of `split`: A + i B goes to z[p], and A* + i B* to z[q]."""
     return written(_write_join, (corner, z), 3)
 
 

@@ -121,7 +121,7 @@ class Judgement:
 
     @property
     def chi2(self) -> float:
-        """chi2 of Eq. (1), for the model image that was computed last."""
+        """The chi2 of Eq. (1), of the model image that was computed last."""
         return float(self.sums.sum()) / max(self.count, 1)
 
 

@@ -115,17 +115,16 @@ def available_parts(instrument: Instrument) -> tuple[str, ...]:
     return tuple(name for name in names if has.get(name, True))
 
 
-def needed_parts(instrument: Instrument, names: Iterable[str]) -> set[str]:
-    """The components that must be computed to obtain those of these names."""
-    route, available = route_of(instrument), set(available_parts(instrument))
-    needed = set(names)
+def needed_parts(names: Iterable[str], available: Iterable[str], *, meshes_in_mask: bool) -> set[str]:
+    """The components that must be computed to obtain those of these names. available: all components of the instrument."""
+    needed, there = set(names), set(available)
     if DIFFRACTION in needed:
-        needed |= {ENTRANCE, FILTER_WHEEL} & available
-    if ENTRANCE in needed and not (route.meshes_in_mask and {ENTRANCE_MESH, MOUNT} <= available):
-        needed |= {ENTRANCE_MESH, MOUNT} & available or {AIRY}
-    if ENTRANCE_MESH in needed and not route.meshes_in_mask:
+        needed |= {ENTRANCE, FILTER_WHEEL} & there
+    if ENTRANCE in needed and not (meshes_in_mask and {ENTRANCE_MESH, MOUNT} <= there):
+        needed |= {ENTRANCE_MESH, MOUNT} & there or {AIRY}
+    if ENTRANCE_MESH in needed and not meshes_in_mask:
         needed.add(AIRY)
-    return needed & available
+    return needed & there
 
 
 def diffraction_patterns(
@@ -142,7 +141,8 @@ def diffraction_patterns(
     The patterns of the spectral lines are multiplied by the weights of the lines and added. mount_image: pixels [y, x] of
     the mount's mask image, if the instrument has one. progress: called with (done, of).
     """
-    route, needed = route_of(instrument), needed_parts(instrument, names)
+    route, available = route_of(instrument), available_parts(instrument)
+    needed = needed_parts(names, available, meshes_in_mask=route.meshes_in_mask)
     patterns = Patterns(notes={"entrance_route": str(route)})
     lines = instrument.spectral_lines
     steps = len(lines) * len(needed) * STEPS_A_PUPIL
@@ -156,7 +156,7 @@ def diffraction_patterns(
         work = _OneWavelength(
             instrument, route, line.wavelength_angstrom, size, mount_image, threads, patterns.notes
         )
-        for name in (part for part in available_parts(instrument) if part in needed):
+        for name in (part for part in available if part in needed):
             report(0, 1)
             work.kernels[name] = work.kernel(name, report)
             report(1, 1)

@@ -67,16 +67,16 @@ class Grid:
 
     @property
     def x_mm(self) -> Vector:
-        """Positions of the samples, shape (samples,)."""
+        """The positions of the samples, (samples,)."""
         return np.asarray((np.arange(self.samples) - (self.samples - 1) / 2) * self.step_mm)
 
     @property
     def edges_mm(self) -> Vector:
-        """Edges of the samples, shape (samples + 1,)."""
+        """The borders between the samples, (samples + 1,)."""
         return np.asarray((np.arange(self.samples + 1) - self.samples / 2) * self.step_mm)
 
     def light(self, field: Wave) -> float:
-        """Light of a field on this grid: sum of abs(E)^2 times the step."""
+        """The light of a field on this grid: sum of abs(E)^2 times the step."""
         return float(np.vdot(field, field).real) * self.step_mm
 
 
@@ -113,12 +113,12 @@ class FresnelStep:
         self._after *= source.step_mm / np.sqrt(1j * reach_mm2)
 
     def apply(self, field: Wave) -> Wave:
-        """The field at the target, shape (target.samples,), from the field at the source."""
+        """The field at the target, (target.samples,), computed from the field at the source."""
         return np.asarray(self._after * self._transform.apply(field * self._before))  # Eq. (1)
 
 
 def conic_sag_mm(x_mm: ArrayLike, *, radius_mm: float, conic: float) -> Vector:
-    """Depth of a conic mirror at x from its vertex, Eq. (3); NaN outside the conic."""
+    """The depth of a conic mirror at x from its vertex, Eq. (3); NaN outside the conic."""
     square = np.square(np.asarray(x_mm, dtype=np.float64))
     root = 1 - (1 + conic) * square / radius_mm**2
     depth = np.sqrt(root, where=root >= 0, out=np.full_like(square, np.nan))
@@ -126,7 +126,7 @@ def conic_sag_mm(x_mm: ArrayLike, *, radius_mm: float, conic: float) -> Vector:
 
 
 def mirror_transmission(mirror: Mirror, grid: Grid) -> Wave:
-    """The factor by which a mirror multiplies a field, shape (samples,): the phase of Eq. (2), and 0 outside the rim."""
+    """The factor by which a mirror multiplies a field: the phase of Eq. (2), and 0 outside the rim, (samples,)."""
     sign = 1.0 if mirror.figure == "convex" else -1.0
     radius_mm = mirror.diameter_mm / 2
     inside = open_share(grid, np.array([[-radius_mm, radius_mm]]))
@@ -156,7 +156,7 @@ def common_openings_mm(first: Vector, second: Vector) -> Vector:
 
 
 def open_share(grid: Grid, openings_mm: Vector) -> Vector:
-    """Share of each sample's length that is open, 0 to 1, shape (samples,)."""
+    """The share of each sample's length that is open, 0 to 1, (samples,)."""
     lengths_mm = np.diff(openings_mm, axis=1).ravel()
     open_before_mm = np.stack([np.cumsum(lengths_mm) - lengths_mm, np.cumsum(lengths_mm)], axis=1)
     open_mm = np.interp(grid.edges_mm, openings_mm.ravel(), open_before_mm.ravel())
@@ -164,7 +164,7 @@ def open_share(grid: Grid, openings_mm: Vector) -> Vector:
 
 
 def fraunhofer_field(openings_mm: Vector, grid: Grid, focal_length_mm: float) -> Wave:
-    """The field in focus of an evenly illuminated pupil, shape (samples,): the sum of the transforms of the openings.
+    """The field in focus of an evenly illuminated pupil: the sum of the transforms of the openings, (samples,).
 
     An opening of width w around c gives w sinc(pi w u) exp(-2 pi i c u), with u = x / (lambda f).
     """
@@ -179,7 +179,7 @@ def fraunhofer_field(openings_mm: Vector, grid: Grid, focal_length_mm: float) ->
 
 
 def binned_light(field: Wave, grid: Grid, samples_per_pixel: int) -> Vector:
-    """Light in each pixel: the sum of abs(E)^2 over the samples of the pixel, times the step."""
+    """The light in each pixel: the sum of abs(E)^2 over the samples of the pixel, times the step."""
     return (np.abs(field) ** 2).reshape(-1, samples_per_pixel).sum(axis=1) * grid.step_mm
 
 

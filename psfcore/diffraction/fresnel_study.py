@@ -108,12 +108,12 @@ class DistanceResult:
 
     @property
     def largest_points(self) -> float:
-        """Largest absolute difference of the mean over phases."""
+        """The largest absolute difference of the two curves, each averaged over the phases of the mesh."""
         return float(np.abs(self.difference_points).max())
 
     @property
     def largest_single_points(self) -> float:
-        """Largest absolute difference of any single phase."""
+        """The largest absolute difference of the two curves for a single phase of the mesh."""
         return float(self.phase_largest_points.max())
 
 
@@ -223,7 +223,7 @@ class _AtWheel:
         ]
 
     def line(self, phase: float) -> Vector:
-        """Light in each pixel, for the mesh shifted by `phase` of its pitch."""
+        """The light in each pixel, for the mesh shifted by `phase` of its pitch."""
         openings_mm = mesh_openings_mm(self.path.wheel_mesh, phase, self._grid.width_mm)
         field = self._field * open_share(self._grid, openings_mm)
         self._lights.append(self._grid.light(field))
@@ -250,7 +250,7 @@ class _AtWheel:
 
 
 def _entrance_line(path: LightPath, focal_length_mm: float) -> Vector:
-    """Fraunhofer image of entrance aperture and mesh in pixels, sum 1."""
+    """The Fraunhofer image of entrance aperture and mesh in pixels, sum 1."""
     grid = path.detector_grid
     field = fraunhofer_field(path.entrance_mm, grid, focal_length_mm)
     line = binned_light(field, grid, SAMPLES_PER_PIXEL)
@@ -278,7 +278,7 @@ def _combined_line(path: LightPath, entrance_line: Vector, distance_mm: float, w
 
 
 def _compared(wheel: _AtWheel, lines: Vector, combined: Vector) -> DistanceResult:
-    """Compute curves and differences from the lines of all phases, shape (phases, 2 REACH_PX + 1)."""
+    """The curves and differences that follow from the lines of all phases, (phases, 2 REACH_PX + 1)."""
     path = wheel.path
     radii_px = np.arange(REACH_PX)
     combined_beyond = 100 * line_light_beyond(combined, radii_px)

@@ -104,37 +104,37 @@ class FrameEvaluation:
 
     @property
     def observed_dn_s(self) -> float:
-        """Mean observed intensity of the dark pixels."""
+        """The mean observed intensity of the dark pixels."""
         return float(self.observed.mean())
 
     @property
     def simulated_dn_s(self) -> float:
-        """Mean simulated intensity of the dark pixels."""
+        """The mean simulated intensity of the dark pixels."""
         return float(self.simulated.mean())
 
     @property
     def error_dn_s(self) -> float:
-        """Mean of simulated minus observed intensity of the dark pixels."""
+        """The mean of simulated minus observed intensity of the dark pixels."""
         return self.simulated_dn_s - self.observed_dn_s
 
     @property
     def pe_pct(self) -> Vector:
-        """PE of each dark pixel, percent, Eq. (2)."""
+        """The percentage error PE of each dark pixel, Eq. (2)."""
         return 100 * (self.simulated - self.observed) / self.observed_dn_s
 
     @property
     def residual_pct(self) -> float:
-        """Mean PE over the dark pixels, percent, Eq. (3)."""
+        """The mean PE over the dark pixels, percent, Eq. (3)."""
         return 100 * self.error_dn_s / self.observed_dn_s
 
     @property
     def noise_pct(self) -> float:
-        """Standard error of the residual, percent."""
+        """The standard error of the residual, percent."""
         return 100 * self.noise_dn_s / self.observed_dn_s
 
     @property
     def centre_dn_s(self) -> tuple[float, float]:
-        """Mean observed and mean simulated intensity at the centre; nan if there are no dark pixels at the centre."""
+        """The mean observed and mean simulated intensity at the centre; nan if there are no dark pixels at the centre."""
         at = at_centre(self.dark, self.found)
         if not at.any():
             return float("nan"), float("nan")
@@ -142,18 +142,18 @@ class FrameEvaluation:
 
     @property
     def centre_pct(self) -> float:
-        """Mean PE at the centre, percent."""
+        """The mean PE at the centre, percent."""
         observed, simulated = self.centre_dn_s
         return 100 * (simulated - observed) / self.observed_dn_s
 
     @property
     def centre_noise_pct(self) -> float:
-        """Standard error of the mean PE at the centre, percent."""
+        """The standard error of the mean PE at the centre, percent."""
         return 100 * self.centre_noise_dn_s / self.observed_dn_s
 
 
 def at_centre(dark: Pixels, found: FoundPlace) -> NDArray[np.bool_]:
-    """Mask of the dark pixels within CENTRE_PX of the centre of the occulter."""
+    """The mask of the dark pixels within CENTRE_PX of the centre of the occulter."""
     place = found.place
     return np.asarray(np.hypot(dark[0] - place.y_px, dark[1] - place.x_px) <= CENTRE_PX)
 
@@ -195,17 +195,17 @@ class Superposed:
 
     @property
     def half_px(self) -> int:
-        """Index of the centre in both axes."""
+        """The index of the centre in both axes."""
         return self.count.shape[0] // 2
 
     @property
     def mpe_rms_pct(self) -> float:
-        """Rms of the MPE over the map."""
+        """The rms of the MPE over the map."""
         return _rms(self.mpe_pct)
 
     @property
     def mpe_noise_rms_pct(self) -> float:
-        """Expected rms of the MPE from noise alone."""
+        """The expected rms of the MPE from noise alone."""
         return _rms(self.noise_mpe_pct)
 
     @property
@@ -215,12 +215,12 @@ class Superposed:
 
     @property
     def mape_mean_pct(self) -> float:
-        """Mean of the MAPE over the map."""
+        """The mean of the MAPE over the map."""
         return float(np.nanmean(self.mape_pct))
 
     @property
     def mape_noise_mean_pct(self) -> float:
-        """Expected mean of the MAPE from noise alone."""
+        """The expected mean of the MAPE from noise alone."""
         return float(np.nanmean(self.noise_mape_pct))
 
     @property

@@ -40,7 +40,7 @@ def bad_card(expected: str, got: object) -> HeaderError:
 
 
 def card_value(header: Header, key: str) -> object:
-    """Value of a structural card, or None. Raises HeaderError if the card is unreadable or occurs more than once."""
+    """The value of a structural card, or None. Raises HeaderError if the card is unreadable or occurs more than once."""
     try:
         if header.count(key) > 1:
             raise bad_card(f"card {key} once", f"it {header.count(key)} times")
@@ -56,7 +56,7 @@ def card_value(header: Header, key: str) -> object:
 def card_count(
     header: Header, key: str, *, smallest: int = 0, largest: int = LARGEST_COUNT, default: int | None = None
 ) -> int:
-    """Whole number in a structural card. Raises HeaderError "bad-card" if it is missing or out of range."""
+    """A whole number in a structural card. Raises HeaderError "bad-card" if it is missing or out of range."""
     value = card_value(header, key)
     if value is None and default is not None:
         return default
@@ -71,13 +71,13 @@ def card_flag(header: Header, key: str) -> bool:
 
 
 def card_text(header: Header, key: str) -> str | None:
-    """Text of a structural card, without surrounding spaces; None if the card is missing or does not hold text."""
+    """The text of a structural card, without surrounding spaces; None if the card is missing or does not hold text."""
     value = card_value(header, key)
     return value.strip() if isinstance(value, str) else None
 
 
 def optional_text(header: Cards, *keys: str) -> str | None:
-    """Text of the first of the cards `keys` that holds a non-empty string; None if no card does.
+    """The text of the first of the cards `keys` that holds a non-empty string; None if no card does.
 
     Surrounding spaces are removed.
     """
@@ -89,7 +89,7 @@ def optional_text(header: Cards, *keys: str) -> str | None:
 
 
 def optional_number(header: Cards, *keys: str) -> float | None:
-    """Value of the first of the cards `keys` that holds a finite number; None if no card does."""
+    """The value of the first of the cards `keys` that holds a finite number; None if no card does."""
     for key in keys:
         value = lenient_value(header, key)
         if isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300:
@@ -98,7 +98,7 @@ def optional_number(header: Cards, *keys: str) -> float | None:
 
 
 def optional_value(header: Cards, key: str) -> str | float | bool | None:
-    """Value of a card: True or False, a finite number, or a text without surrounding spaces; otherwise None."""
+    """The value of a card: True or False, a finite number, or a text without surrounding spaces; otherwise None."""
     value = lenient_value(header, key)
     if isinstance(value, bool):
         return value
@@ -107,7 +107,7 @@ def optional_value(header: Cards, key: str) -> str | float | bool | None:
 
 
 def lenient_value(header: Cards, key: str) -> object:
-    """Value of an optional, descriptive card; None if the card is missing or damaged."""
+    """The value of an optional, descriptive card; None if the card is missing or damaged."""
     try:
         return header[key]
     except KeyError:

@@ -38,7 +38,7 @@ UNIT: Matrix = ((1.0, 0.0), (0.0, 1.0))
 
 @dataclass(frozen=True)
 class Frame:
-    """The frame of an image.
+    """How the pixels of an image lie on the detector.
 
     scale_arcsec: plate scale along x and y, arcsec/px; None: unknown. on_detector: T of Eq. (2). roll_known: whether a card
     states the roll of the detector. interpolated: why the pixels are not those of the detector; None: they are.
@@ -51,7 +51,7 @@ class Frame:
 
     @property
     def quarter_turns(self) -> Matrix | None:
-        """T with the values -1, 0 and 1, if the image was turned by quarter turns, or flipped; None for other angles."""
+        """The quarter turns and flips of the image, as T with the values -1, 0 and 1; None if it was turned by another angle."""
         limit = SILENT_DEG if self.roll_known else SILENT_WITHOUT_ROLL_DEG
         (a, b), (c, d) = self.on_detector
         nearest: Matrix = ((float(round(a)), float(round(b))), (float(round(c)), float(round(d))))
@@ -66,7 +66,7 @@ class Frame:
 
     @property
     def turn_to_build_deg(self) -> float:
-        """The turn for which a PSF must be built, to 0.01 degrees; 0 if a PSF of the detector can be turned or is as it must be."""
+        """The turn (to 0.01 degrees) for which a PSF must be built; 0 if the PSF of the detector can be used, turned or as it is."""
         return 0.0 if self.flipped or self.quarter_turns is not None else round(self.turn_deg, 2)
 
     @property

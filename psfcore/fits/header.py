@@ -95,7 +95,7 @@ class HeaderSummary:
 def read_summary(
     path: str | os.PathLike[str], limits: FitsLimits, *, hdu: int | None = None
 ) -> HeaderSummary:
-    """Summary of the first 2-D image of a file, or of the image in HDU `hdu`.
+    """The summary of the first 2-D image of a file, or of the image in HDU `hdu`.
 
     Raises HeaderError if the file has no usable image there.
     """
@@ -184,7 +184,7 @@ def origin_of(header: Cards) -> tuple[str | None, dict[str, str]]:
 
 
 def wavelength_angstrom(header: Cards) -> float | None:
-    """Wavelength of an image in angstrom: WAVELNTH in the unit WAVEUNIT; without WAVELNTH, the text WAVE_LEN of TRACE.
+    """The wavelength of an image in angstrom: WAVELNTH in the unit WAVEUNIT; without WAVELNTH, the text WAVE_LEN of TRACE.
 
     If WAVEUNIT is missing, the unit is angstrom. Returns None if WAVELNTH is missing or not above 0, or if the unit is
     unknown.
@@ -207,7 +207,7 @@ def known_instrument(header: Cards) -> str | None:
 
 
 def optional_exposure_s(header: Cards) -> float | None:
-    """Exposure time in s: the value of XPOSURE, or else of EXPTIME. None if neither card holds a number above zero."""
+    """The exposure time in s: the value of XPOSURE, or else of EXPTIME. None if neither card holds a number above zero."""
     for key in ("XPOSURE", "EXPTIME"):
         exposure = optional_number(header, key)
         if exposure is not None and exposure > 0:

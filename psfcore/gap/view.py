@@ -209,14 +209,14 @@ class View:
 
     @cached_property
     def places(self) -> tuple[Field, Field]:
-        """Position of each pixel on the detector: x and y [y, x], each from -0.5 to 0.5 across the image."""
+        """The position of each pixel on the detector: x and y [y, x], each from -0.5 to 0.5 across the image."""
         ny, nx = self.solution.transit.shape
         x = ((np.arange(nx) + 0.5) / nx - 0.5).astype(np.float32)
         y = ((np.arange(ny) + 0.5) / ny - 0.5).astype(np.float32)
         return np.broadcast_to(x, (ny, nx)), np.broadcast_to(y[:, None], (ny, nx))
 
     def exposure_s(self, n: int) -> float:
-        """Exposure time of frame n, s."""
+        """The exposure time of frame n, s."""
         return self.solution.transit.frames[n].exposure_s
 
     def blurred(self, n: int, slope: Blur, weight: Field | None = None) -> Field:

@@ -83,7 +83,7 @@ def workload(instrument: Instrument, size: int) -> Workload:
 
 
 def windows_of(mesh: Mesh) -> int:
-    """Number of windows of the series of a mesh.
+    """The number of windows of the series of a mesh.
 
     For a mesh at the entrance, the pattern of the aperture gives the orders their width. The orders of the series
     itself must then be narrow, so the number of windows is at least NARROW_WINDOWS.
@@ -92,8 +92,7 @@ def windows_of(mesh: Mesh) -> int:
 
 
 def check_workload(instrument: Instrument, label: str) -> None:
-    """Raise DataError "bad-instrument-file" if the PSF of an instrument, at its largest size, needs too large
-    arrays."""
+    """Raise DataError "bad-instrument-file" if the largest PSF of an instrument needs arrays that are too large."""
     largest = workload(instrument, LARGEST_SIZE_PX)
     if largest.samples > MOST_SAMPLES:
         expected = (

@@ -119,7 +119,7 @@ CORRECTED_ALONE = {
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """Eq. (1) for n pixels: observed, unscattered and scale have shape (n,); ring_sums has shape (n, segments).
+    """The equations (1) of n pixels: observed, unscattered and scale (n,), and ring_sums (n, segments).
 
     stratum: for an occulted pixel, the shell of the selection mask that contains it (0: outermost); for other pixels,
     UNOCCULTED. scale: the number by which the equation is divided.

@@ -140,7 +140,7 @@ class Reconstruction:
         return scene
 
     def residual(self, n: int) -> tuple[Vector, Vector]:
-        """r of Eq. (1) for the dark pixels of image n, and the expected intensity of these pixels, DN/s."""
+        """Observed minus expected intensity of the dark pixels of image n, r of Eq. (1), and the expected intensity, DN/s."""
         expected = pick(self.optics.convolve(self.blanked_scene(n)), self.sky.dark[n])
         return self.observed(n) - expected, expected
 
@@ -223,17 +223,17 @@ class Inversion:
 
     @property
     def values(self) -> dict[str, float]:
-        """Parameter values by name."""
+        """The values of the parameters, by name."""
         return self.shape.values(self.coordinates)
 
     @property
     def value_sigma(self) -> dict[str, float]:
-        """Standard errors of the parameters by name."""
+        """The standard errors of the parameters, by name."""
         return self.shape.value_sigma(self.coordinates, self.covariance)
 
     @property
     def chi2_per_pixel(self) -> float:
-        """chi2 of all dark pixels divided by the degrees of freedom.
+        """The chi2 of all dark pixels, divided by the degrees of freedom.
 
         The result is about 1 if photon and read noise explain the residuals.
         """

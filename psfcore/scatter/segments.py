@@ -101,7 +101,7 @@ class Segments:
 
     @cached_property
     def counts(self) -> NDArray[np.int64]:
-        """n_S of Eq. (1), array (size,). It is 0 for a shell that is too narrow to contain a pixel."""
+        """The number of pixels of each segment, n_S of Eq. (1), (size,). It is 0 for a shell that is too narrow to contain a pixel."""
         label = self._reach_map.ravel()
         return np.bincount(label + 1, minlength=self.size + 1)[1:]
 
@@ -167,7 +167,9 @@ def beyond_pct(light: Floats) -> Floats:
 def segment_sums(
     image: NDArray[np.floating], targets: NDArray[np.integer], segments: Segments, *, threads: int = 1
 ) -> Floats:
-    """A_S of Eq. (3), array (n, segments.size), in the image's unit times px^2; exact to float64 rounding.
+    """The sums of the image over the segments around each target, A_S of Eq. (3), (n, segments.size).
+
+    The sums are in the image's unit times px^2, exact to float64 rounding.
 
     image: [y, x], float32 or float64; it is taken as 0 beyond its edges. targets: (n, 2), the (y, x) of each target on the
     image, in any order. threads: number of threads that share the targets; it does not change the result. Raises

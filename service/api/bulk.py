@@ -289,7 +289,7 @@ def list_failures(bulk_id: BulkId, paging: Paging, caller: Reading, state: Share
 
 @router.post("/{bulk_id}/pause", summary="Pause a bulk run")
 def pause_bulk(bulk_id: BulkId, caller: Bulk, state: Shared) -> BulkView:
-    """Start no more images. Workers finish the images that they have started."""
+    """Pause a run: workers finish the images that they have started, and start no others."""
     row = find(state, caller, bulk_id)
     _done(state.catalogue.bulks.pause(row.id), row, "LISTING or RUNNING")
     return get_bulk(bulk_id, caller, state)

@@ -65,7 +65,7 @@ FOR_ALL = (401, 403)
     required=True,
     type=OutputPlace(decides=True),
     metavar="FILE|FOLDER/",
-    help="Write the product (FITS) to this file, several into this folder",
+    help="Write the product (FITS) to this file, or the products of several images into this folder",
 )
 @PSF
 @options_of(Deconvolve, *OPTIONS)

@@ -2,7 +2,7 @@
 Python use too, without catalogue and store.
 
 `Local` reads the user's files where they are and gives them the ids that a service would give. A result is written only when
-the command asks for a file of it.
+the command names a file for the result.
 """
 
 from __future__ import annotations

@@ -407,7 +407,7 @@ class Client(Connection, Operations):
         """Estimate a bulk run without starting it. The other arguments and the errors are those of ``submit_bulk``.
 
         sample: largest number of images whose headers are examined; default: 200. "images" is the number of images that
-        were found, "seconds" the expected time of the run with the workers of now, "output_bytes" the expected size of the
+        were found, "seconds" the expected time of the run with the present workers, "output_bytes" the expected size of the
         products; "refused" has the examined images that the run would refuse, with the reasons.
         """
         body = _bulk_request(**request)

@@ -118,13 +118,13 @@ class Problem(HTTPException):
 
 
 def problem(error: DataError, **more: Any) -> Problem:
-    """The problem for an error of the request or its data, with the fields of the error. more: further fields."""
+    """The HTTP error for a DataError, with the same code, message and fields. more: fields to add."""
     return Problem(STATUS_OF.get(error.code, 422), error.code, error.message, **{**error.fields, **more})
 
 
 @contextmanager
 def as_problems() -> Iterator[None]:
-    """Raise the errors of a request or its data that occur in the ``with`` block as problems."""
+    """Turn each DataError of the ``with`` block into an HTTP error."""
     try:
         yield
     except DataError as error:

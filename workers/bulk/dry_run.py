@@ -55,17 +55,19 @@ class BulkEstimate(BaseModel):
 
     images: int = Field(description="images that were found")
     complete: bool = Field(
-        description=f"false: {BUDGET_S:g} s were not enough to list all files and to examine the sample, so the run is larger or "
-        "the sample smaller",
+        description=f"false: {BUDGET_S:g} s were not enough to list all files and to examine the sample, so the run may have more images "
+        "than are counted here, or the sample fewer than were asked for",
     )
     examined: int = Field(description="images of the sample whose headers were read")
     refused_images: int = Field(description="examined images that the run would refuse")
-    refused: list[Refused] = Field(description=f"the first {MOST_REFUSED} of them, with the reasons")
+    refused: list[Refused] = Field(
+        description=f"the first {MOST_REFUSED} images that the run would refuse, with the reasons"
+    )
     existing: int = Field(
         description="examined uploads whose product exists already; for files this is not known before the run",
     )
     output_bytes: int = Field(description="expected size of all products, without their pictures")
-    seconds: float = Field(description="expected time of the run with the workers of now")
+    seconds: float = Field(description="expected time of the run with the workers that run at present")
     workers: int = Field(description="worker processes now; 1 if there are none")
     memory_mib: int = Field(description="memory that the largest examined image needs")
     example_output: str | None = Field(

@@ -218,7 +218,7 @@ class Bulks(Queries):
             return True
 
     def end_listing(self, bulk_id: str, lease: Lease) -> bool:
-        """LISTING -> RUNNING, or LISTING -> COMPLETED if no image is left. Returns False under the conditions of
+        """Let a run whose files are all listed go on, or end if no image is left. Returns False under the conditions of
         ``add_listed``."""
         with self._database.writing.begin() as session:
             bulk = _listed_by(session, bulk_id, lease)

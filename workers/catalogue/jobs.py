@@ -126,7 +126,7 @@ class Jobs(Queries):
         self._set([JobRow.id == job_id, JobRow.phase == Phase.QUEUED], submitted_at=None)
 
     def claim(self, job_id: str, worker: str) -> Lease | None:
-        """QUEUED -> EXECUTING. If several workers try, exactly one gets the lease; the others get None.
+        """Give a queued job to a worker. If several workers try, exactly one gets the lease; the others get None.
 
         While another job with the same result executes, every worker gets None; the reconciler submits the job again
         later.
@@ -194,15 +194,15 @@ class Jobs(Queries):
         )
 
     def complete(self, lease: Lease, result_id: str) -> bool:
-        """EXECUTING -> COMPLETED. Returns False if the lease is lost."""
+        """End an executing job as COMPLETED. Returns False if the lease is lost."""
         return self._end(lease, Phase.COMPLETED, result_id=result_id)
 
     def fail(self, lease: Lease, error: JobError) -> bool:
-        """EXECUTING -> ERROR. Returns False if the lease is lost."""
+        """End an executing job as ERROR. Returns False if the lease is lost."""
         return self._end(lease, Phase.ERROR, error=error.model_dump(mode="json"))
 
     def abort(self, lease: Lease) -> bool:
-        """EXECUTING -> ABORTED, when the worker has stopped a cancelled job. Returns False if the lease is lost."""
+        """End a cancelled job as ABORTED, after its worker has stopped it. Returns False if the lease is lost."""
         return self._end(lease, Phase.ABORTED, JobRow.cancel_requested.is_(True))
 
     def _end(self, lease: Lease, phase: Phase, *conditions: ColumnElement[bool], **values: Any) -> bool:
@@ -210,7 +210,7 @@ class Jobs(Queries):
         return self._set([*_held(lease), *conditions], **ended, **values)
 
     def requeue(self, lease: Lease) -> bool:
-        """EXECUTING -> QUEUED after a transient failure. Returns False if the lease is lost.
+        """Queue an executing job again after a transient failure. Returns False if the lease is lost.
 
         The job is submitted again after the waiting time of ``unsubmitted``. A cancelled job is aborted instead.
         """
@@ -218,7 +218,7 @@ class Jobs(Queries):
         return self._set(_held(lease), **self._again(), **delay)
 
     def cancel(self, job_id: str) -> None:
-        """PENDING, QUEUED -> ABORTED. The worker of an executing job is told to stop; an ended job does not change."""
+        """Abort a pending or queued job, and tell the worker of an executing job to stop. An ended job does not change."""
         at_work = JobRow.phase == Phase.EXECUTING
         self._set(  # one statement, because between two statements the job could be claimed or queued again
             [JobRow.id == job_id, JobRow.phase.in_((Phase.PENDING, Phase.QUEUED, Phase.EXECUTING))],
@@ -228,8 +228,8 @@ class Jobs(Queries):
         )
 
     def hand_back(self, lease: Lease) -> bool:
-        """EXECUTING -> QUEUED, because the worker stops. The attempt does not count. Returns False if the lease is
-        lost."""
+        """Queue an executing job again, because its worker stops. The attempt does not count. Returns False if the lease
+        is lost."""
         return self._set(
             [*_held(lease), JobRow.cancel_requested.is_(False)],
             phase=Phase.QUEUED,
@@ -310,7 +310,7 @@ class Jobs(Queries):
         return self._database.first(query.order_by(JobRow.created_at.desc()))
 
     def reopen(self, job_id: str) -> bool:
-        """COMPLETED -> QUEUED. The job then has the state of a job that has not run. Returns False if the job is not
+        """Queue a completed job again. The job then has the state of a job that has not run. Returns False if the job is not
         COMPLETED."""
         again = {
             "phase": Phase.QUEUED,

@@ -328,10 +328,11 @@ def _deprecate(session: Session, row: PsfRow, asked: StatusAsked, by: str) -> No
         supersedes=asked.supersedes or None,
     )
     if row.status == PsfStatus.DEPRECATED and (row.successor_id is not None or asked.successor_id is None):
-        has = f"successor {row.successor_id}, which cannot change" if row.successor_id else "no successor"
         raise DataError(
             "successor-named",
-            f"expected a first successor for the deprecated PSF {row.id}, which has {has}; got {asked.successor_id or 'no successor'}",
+            f"expected the successor of the deprecated PSF {row.id}; got none: name a certified PSF of its series"
+            if row.successor_id is None
+            else f"expected a deprecated PSF without a successor; PSF {row.id} has successor {row.successor_id}, which cannot change",
         )
     if asked.successor_id is not None:
         successor = session.get(PsfRow, (row.owner, asked.successor_id))

@@ -74,7 +74,7 @@ class UwsJobs:
         request_key: str,
         estimate: dict[str, Any] | None = None,
     ) -> bool:
-        """PENDING -> QUEUED with ``parameters``, which were resolved from ``given``.
+        """Queue a pending job with ``parameters``, which were resolved from ``given``.
 
         Returns False if the job is not PENDING, or if its parameters are no longer ``given``. If an identical request
         has a job that is queued, executing or completed, this job gets a different key. This job then waits until the

@@ -70,7 +70,7 @@ def check_noise(transit: Mapping[str, Any], noise: NoiseFigures | None) -> None:
 
 
 def psf_identity(build: PsfBuild) -> str:
-    """Identity of a built PSF: bytes of the instrument file, parameters, version of the algorithm.
+    """The identity of a built PSF: the hash of the instrument file, the parameters and the version of the algorithm.
 
     Raises DataError "unknown-instrument" if no instrument file with this name is shipped.
     """
@@ -106,7 +106,7 @@ _ALWAYS_HASHED = (
 
 
 def product_identity(request: ResolvedDeconvolve) -> str:
-    """Identity of a deconvolved image: bytes of the input, PSF, method with all parameters, versions of algorithm and file."""
+    """The identity of a deconvolved image: the hash of the input, the PSF, the method and its parameters, and the versions of algorithm and file."""
     # The id of the PSF determines the PSF. The recipe and the interpolation only say how to make the PSF, and the context
     # where it was found. `again` only permits a second deconvolution; the image itself determines whether this deconvolution
     # is a second one.
@@ -132,25 +132,25 @@ def product_identity(request: ResolvedDeconvolve) -> str:
 
 
 def psf_fit_identity(request: ResolvedPsfFit | ResolvedCrossValidate) -> str:
-    """Identity of a fit or a cross-validation: bytes of the transit, parameters, diffraction PSF, version of the algorithm."""
+    """The identity of a fit or a cross-validation: the hash of the transit, the parameters, the diffraction PSF and the version of the algorithm."""
     return _transit_identity("psf-fit" if isinstance(request, ResolvedPsfFit) else "cross-validate", request)
 
 
 def report_identity(request: ResolvedReport) -> str:
-    """Identity of a report: bytes of the transit, parameters, PSF or diffraction PSF, version of the algorithm."""
+    """The identity of a report: the hash of the transit, the parameters, the PSF or diffraction PSF, and the algorithm version."""
     return _transit_identity("report", request)
 
 
 def gap_identity(request: ResolvedGapDiagnose) -> str:
-    """Identity of a diagnosis: bytes of the transit, parameters, PSF, diffraction PSF, source text of the library of
-    effects, version of the algorithm."""
+    """The identity of a diagnosis: the hash of the transit, the parameters, the PSFs, the source text of the library of
+    effects, and the version of the algorithm."""
     # Diagnoses without added effects keep the ids that they had before the texts of added effects were hashed.
     excluded = () if request.added_effects_sha256 else ("added_effects_sha256",)
     return _transit_identity("gap-diagnose", request, excluded, library=library_sha256())
 
 
 def diffraction_identity(request: ResolvedOnTransit) -> str | None:
-    """Identity of the diffraction PSF that the job has to build; None if the transit contains a known PSF or the
+    """The identity of the diffraction PSF that the job has to build; None if the transit contains a known PSF or the
     request names a PSF."""
     return None if request.diffraction_recipe is None else psf_identity(request.diffraction_recipe)
 
@@ -188,10 +188,10 @@ interpolated_psf_identity = request_identity("psf-interpolate")
 
 
 def rerun_identity(request: ResolvedRerun, job_id: str) -> str:
-    """Identity of the report of a rerun. The identity contains the job's id, so that every rerun is executed."""
+    """The identity of the report of a rerun. The identity contains the job's id, so that every rerun is executed."""
     return canonical_hash({"kind": "rerun", "of": request.of, "id": request.id, "job": job_id})
 
 
 def corrected_psf_identity(diagnosis: str) -> str:
-    """Identity of the corrected PSF that a diagnosis adds: the fit with the effects of the answer in the model."""
+    """The identity of the corrected PSF that a diagnosis adds: the fit with the effects of the answer in the model."""
     return canonical_hash({"kind": "gap-corrected-psf", "diagnosis": diagnosis})

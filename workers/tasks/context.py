@@ -63,8 +63,8 @@ class Context:
         return FitsLimits(max_pixels=self.settings.max_pixels)
 
     def made(self, table: type[Result], identity: str) -> Result | None:
-        """The result of an earlier job; None if there is no such result or if a file of it is lost. If the answer is
-        None, the task makes the result.
+        """The result of an earlier job; None if there is no such result or if one of its files is lost. If the
+        answer is None, the task makes the result.
         """
         row = self.catalogue.get(table, identity, self.owner)
         return row if row is not None and intact(self.store, row) else None
@@ -72,7 +72,7 @@ class Context:
     def add(self, row: Result) -> Result:
         """Add a result, whose files are in the store; returns the row in the catalogue.
 
-        If an earlier result has this identity and a file of it is lost, its row gets the new files. Raises DataError
+        If an earlier result has this identity and has lost a file, its row gets the new files. Raises DataError
         "psf-not-the-same" if this would change the content of a PSF that was certified.
         """
         there, new = self.catalogue.add(row)

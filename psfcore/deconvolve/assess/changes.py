@@ -182,7 +182,7 @@ def counted_pixels(image: Image, result: Plane, edge_px: int) -> Flags:
 
 
 def block_means(plane: Plane, counted: Flags, block_px: int) -> Plane:
-    """Means of blocks of block_px x block_px pixels, shape (n_blocks,).
+    """The mean of each block of block_px x block_px pixels, (n_blocks,).
 
     Only blocks whose pixels are all counted are used.
     """

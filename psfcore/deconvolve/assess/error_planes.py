@@ -126,7 +126,7 @@ def error_planes(
 
 
 def expected_image(image: Image, estimate: Plane, psf: Psf, *, threads: int = 1) -> Plane:
-    """Compute m of Eq. (1): the model image, without noise, of the scene `estimate` [y, x]. It is not below zero."""
+    """The image [y, x] without noise that is expected of the scene `estimate`, m of Eq. (1). It is not below zero."""
     finite = np.isfinite(estimate)
     scene = np.where(finite, estimate, _local_mean(estimate, finite, MODEL_WINDOW_PX))
     convolved = np.maximum(
@@ -141,7 +141,7 @@ def expected_image(image: Image, estimate: Plane, psf: Psf, *, threads: int = 1)
 def spread_of_results(
     psfs: Sequence[Psf], run: Callable[[Psf], Plane], *, progress: Progress | None = None
 ) -> Plane:
-    """Standard deviation [y, x] of run(psf) over the sigma points of a covariance, whose variance is exact.
+    """The standard deviation [y, x] of the results of `run` for the PSFs at the sigma points of a covariance.
 
     Raises DataError "bad-draws" for fewer than two PSFs.
     """
@@ -159,7 +159,9 @@ def spread_of_results(
 
 
 def sigma_points(mean: NDArray[np.float64], covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Make 2 p parameter vectors, shape (2 p, p). With equal weights they have this mean (p,) and covariance (p, p).
+    """The parameter vectors whose mean and covariance are exactly the given ones: two for each parameter, (2 p, p).
+
+    mean: (p,). covariance: (p, p).
 
     Raises DataError "bad-covariance" if the covariance is not symmetric or has a negative eigenvalue.
     """

@@ -82,7 +82,7 @@ def cells_of(dark: Pixels, x_px: float, y_px: float) -> Cells:
 
 
 def sensitivities(optics: Optics, dark: Pixels, weights: Matrix) -> Planes:
-    """q of Eq. (1): the derivative of the mean of each cell with respect to every pixel of the image, (cells, ny, nx)."""
+    """The derivative of the mean of each cell with respect to every pixel, q of Eq. (1), (cells, ny, nx)."""
     out = []
     for weight in weights:
         cell = np.zeros(optics.engine.lanes_shape, np.float32)

@@ -148,8 +148,10 @@ class LinearModel:
         return np.asarray(step.covariance @ (self._prior[list(step.columns)] * taken_out))
 
     def learned(self, columns: Sequence[int]) -> Vector:
-        """l of Eq. (3) for the columns of random fields in `columns`. The other columns of `columns` and the PSF are
-        refitted."""
+        """How much the data say about the random fields in `columns`, compared with the prior: l of Eq. (3).
+
+        The other columns of `columns` and the PSF are refitted.
+        """
         prior = self.evidence.prior
         field = [column for column in columns if prior.field[column]]
         if not field:
@@ -177,7 +179,7 @@ class LinearModel:
         return tuple(d.residual - d.jacobian[list(step.columns)].T @ step.values for d in self.discs)
 
     def left_unocculted(self, step: Step) -> float:
-        """chi2 of the unocculted blocks after a fit, divided by unocculted_scale. Flickering blocks have a low weight."""
+        """The chi2 of the unocculted blocks after a fit, divided by unocculted_scale. Flickering blocks have a low weight."""
         here, unocculted = list(step.columns), self.evidence.steady_unocculted
         theta = step.values
         fall = 2 * theta @ unocculted.score[here] - theta @ unocculted.normal[np.ix_(here, here)] @ theta

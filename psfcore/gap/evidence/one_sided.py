@@ -32,7 +32,7 @@ Vector = NDArray[np.float64]
 
 
 def log_odds_at_zero(slope: Vector, normal: Vector, width: Vector) -> Vector:
-    """ln of the factor of Eq. (1) for each parameter. All arguments have one entry for each parameter.
+    """The logarithm of the odds of each parameter whose best value is 0, Eq. (1). The arguments have one entry for each.
 
     slope, normal: the slope of ln L and the curvature of -ln L at the value 0. A slope above 0, which remains if a parameter was
     set to 0 before the others, counts as 0. width: the width of the prior.
@@ -43,13 +43,19 @@ def log_odds_at_zero(slope: Vector, normal: Vector, width: Vector) -> Vector:
 
 
 def log_odds_above_zero(best: Vector, error: Vector, width: Vector) -> Vector:
-    """ln of the Savage-Dickey ratio for each parameter. best: its value, whose error is `error`. width: the width of the prior."""
+    """The logarithm of the odds of each parameter whose best value is above 0 (Savage-Dickey ratio).
+
+    best, error: the best value and its error. width: the width of the prior.
+    """
     above = best / error
     return np.asarray(math.log(2) + np.log(error / width) + log_ndtr(above) + above**2 / 2)
 
 
 def log_of_any_number(log_odds: Vector, least: int = 1) -> float:
-    """ln of Eq. (2): the evidence if any number of the parameters act, divided by that if all are 0. least: the least number, 0 or 1."""
+    """The logarithm of Eq. (2): the evidence if some of the parameters act, divided by the evidence if all are 0.
+
+    log_odds: the logarithm of the odds of each parameter. least: the least number of parameters that act, 0 or 1.
+    """
     count = log_odds.size
     sums = np.full(count + 1, -np.inf)  # ln e_k of the odds so far
     sums[0] = 0.0

@@ -227,12 +227,15 @@ class NearDisc:
     to_displacements: NDArray[np.floating]
 
     def of_kernel(self, change: Plane) -> Vector:
-        """T of Eq. (3) for each cell (cells,). change: the change of the PSF [y, x], with the centre at [n // 2, n // 2]."""
+        """The response of each cell to a change of the PSF, T of Eq. (3), (cells,).
+
+        change: the change of the PSF [y, x], with the centre at [n // 2, n // 2].
+        """
         near = crop_or_pad(change, 2 * NEAR_REACH_PX + 1).astype(np.float32)
         return np.asarray(np.tensordot(self.to_displacements, near, axes=2), dtype=np.float64)
 
     def of_copies(self, image: Field, dx: int, dy: int, reach_px: int) -> Plane:
-        """T of Eq. (1) for each cell and each copy of an image [y, x]: (cells, copies y, copies x).
+        """The response of each cell to each copy of an image [y, x], T of Eq. (1): (cells, copies y, copies x).
 
         The copies are displaced by (dx, dy) and up to reach_px more along each axis, in whole pixels.
         """

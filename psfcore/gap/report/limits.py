@@ -51,7 +51,7 @@ def pair_rows(limits: Limits) -> list[Row]:
 
 
 def distance_table(limits: Limits) -> tuple[Row, list[Row]]:
-    """The distances of all pairs. The rows number the effects; the columns have the same numbers."""
+    """The table of the distances between the effects, in pairs. The rows number the effects; the columns have the same numbers."""
     names, rows = list(limits.effects), []
     for k, name in enumerate(names, 1):
         cells = [

@@ -40,7 +40,10 @@ class Calibration:
     about: Mapping[str, Any]
 
     def threshold(self, coverage: float = COVERAGE) -> float:
-        """Eq. (1). Raises DataError "bad-coverage" if there are too few cases for this coverage."""
+        """The probability from which a hypothesis belongs to the answer set, Eq. (1).
+
+        Raises DataError "bad-coverage" if there are too few cases for this coverage.
+        """
         count = len(self.true_shares)
         rank = min(int((count + 1) * (1 - coverage) + 1e-9), count)
         if not 0 < coverage < 1 or rank < 1:
