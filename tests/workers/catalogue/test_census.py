@@ -2,32 +2,24 @@
 
 from __future__ import annotations
 
-import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import pytest
 from sqlalchemy import text
 
 from psfcore.errors import DataError
-from tests.workers.conftest import Clock
 from tests.workers.databases import BOTH, change
-from tests.workers.jobs import claimed, job_row
+from tests.workers.jobs import Bench, claimed
 from tests.workers.psf_examples import psf
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.census import FileTally
-from workers.catalogue.tables import DEFAULT_OWNER, ImageRow, JobRow
+from workers.catalogue.tables import DEFAULT_OWNER, ImageRow
 from workers.contract.jobs import Phase
-from workers.files.store import Store
-from workers.run.runner import Runner
-from workers.settings import Settings
-from workers.stage_timer import STARTING, Spent
+from workers.stage_timer import Spent
 from workers.tasks.context import Context
-
-Task = Callable[[Context, Mapping[str, Any]], str]
 
 
 def test_the_counts_of_files_and_jobs(catalogue: Catalogue) -> None:
@@ -67,40 +59,6 @@ def test_times_of_many_attempts_are_summed(catalogue: Catalogue) -> None:
     }
 
 
-def run(folder: Path, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch, task: Task) -> JobRow:
-    """The row of a job of this task after an attempt."""
-    settings = Settings(data_dir=folder / "data", broker_url="filesystem://")
-    monkeypatch.setattr("workers.tasks.psf_build.psf_build", task)
-    job, _ = catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)
-    Runner(settings, catalogue, Store(settings.data_dir)).run(job.id)
-    return job_row(catalogue, job.id)
-
-
-def test_an_attempt_stores_its_stages_without_the_time_of_writing(
-    tmp_path: Path, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch, clock: Clock
-) -> None:
-    written = catalogue.jobs.progress
-
-    def slowly(*given: Any) -> bool:
-        clock.now += 1000.0
-        return written(*given)
-
-    def works(context: Context, _: Mapping[str, Any]) -> str:
-        for step in range(4):
-            clock.now += 2.0 * (step > 0)
-            context.report("at work: on something", step, 3)
-        return "result"
-
-    monkeypatch.setattr(catalogue.jobs, "progress", slowly)
-    job = run(tmp_path, catalogue, monkeypatch, works)
-    assert job.phase == Phase.COMPLETED
-    times = catalogue.stage_times.all()
-    assert set(times) == {("psf-build", STARTING), ("psf-build", "at work")}
-    assert times["psf-build", "at work"] == Spent(pytest.approx(6.0), 3)
-    catalogue.uws.destroy(job.id)
-    assert catalogue.stage_times.all() == times
-
-
 def fails(context: Context, _: Mapping[str, Any]) -> str:
     context.report("at work", 1, 2)
     raise DataError("bad", "no good")
@@ -116,19 +74,22 @@ def works(context: Context, _: Mapping[str, Any]) -> str:
     return "result"
 
 
-@pytest.mark.parametrize(("task", "phase"), [(fails, Phase.ERROR), (passing, Phase.QUEUED)])
-def test_failed_attempts_count_too(
-    tmp_path: Path, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch, task: Task, phase: Phase
+def test_the_stages_of_every_attempt_count_also_after_its_job_was_deleted(
+    catalogue: Catalogue, bench: Bench
 ) -> None:
-    assert run(tmp_path, catalogue, monkeypatch, task).phase == phase
-    assert catalogue.stage_times.all()["psf-build", "at work"].steps == 1
+    for number, (task, phase) in enumerate(
+        ((works, Phase.COMPLETED), (fails, Phase.ERROR), (passing, Phase.QUEUED)), 1
+    ):
+        job = bench.run(task)
+        assert job.phase == phase
+        catalogue.uws.destroy(job.id)
+        assert catalogue.stage_times.all()["psf-build", "at work"].steps == number
 
 
 def test_a_job_ends_normally_if_its_times_cannot_be_stored(
-    tmp_path: Path, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    catalogue: Catalogue, bench: Bench, caplog: pytest.LogCaptureFixture
 ) -> None:
     change(catalogue, text("ALTER TABLE stage_times RENAME TO elsewhere"))
-    with caplog.at_level(logging.WARNING, "workers.run.runner"):
-        job = run(tmp_path, catalogue, monkeypatch, works)
+    job = bench.run(works)
     assert (job.phase, job.result_id) == (Phase.COMPLETED, "result")
     assert "could not keep its stage times" in caplog.text
