@@ -35,9 +35,7 @@ def report(catalogue: Catalogue, digest: str, owner: str, made_at: float) -> str
 
 
 @BOTH
-def test_the_rule_of_an_owner_replaces_the_general_one_and_the_dry_run_deletes_nothing(
-    catalogue: Catalogue, tmp_path: Path
-) -> None:
+def test_the_rule_of_an_owner_replaces_the_general_one(catalogue: Catalogue, tmp_path: Path) -> None:
     store = Store(tmp_path / "store")
     files = {name: kept(store, name.encode()) for name in ("old", "new", "bob", "shared")}
     report(catalogue, files["old"], "ann", OLD)
