@@ -106,21 +106,6 @@ def test_a_long_job_pauses_for_the_short_job_of_another_owner(bench: Bench) -> N
     )
 
 
-def test_the_time_of_a_pause_counts_for_the_short_job_alone(bench: Bench, clock: Clock) -> None:
-    clock.now = time.perf_counter()  # a timer begins with the true time
-
-    def work(owner: str, step: int) -> None:
-        clock.now += 1000.0 if owner == "short" else 0.0
-
-    bench.during = work
-    long = bench.submit("long", seconds=60)
-    bench.submit("short")
-    bench.run(long)
-    assert bench.ended == ["short", "long"]
-    spent = sum(stage.seconds for stage in bench.catalogue.stage_times.all().values())
-    assert spent == pytest.approx(1000.0 * STEPS, abs=300.0)
-
-
 def test_pauses_are_short_and_do_not_count(catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
     clock, looks = Clock(), []
     monkeypatch.setattr(attempt, "time", clock)

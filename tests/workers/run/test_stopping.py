@@ -81,7 +81,8 @@ def test_a_cancelled_job_is_not_handed_back(bench: Bench) -> None:
         bench.stopping.ask(0.0)
         return steps_for(60.0)(context, {})
 
-    assert bench.run(cancelled).phase == Phase.ABORTED
+    row = bench.run(cancelled)
+    assert (row.phase, row.result_id) == (Phase.ABORTED, None)
 
 
 # Heartbeats -----------------------------------------------------------------------------------------

@@ -17,10 +17,8 @@ from service.client.http import ServiceError
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
 from tests.in_process import InProcess
 from tests.workers.jobs import job_row
-from workers.catalogue.tables import DEFAULT_OWNER, ProductRow
 from workers.contract.jobs import Phase
 from workers.contract.requests import METHODS
-from workers.run import attempt
 from workers.run.runner import Runner
 from workers.settings import Settings, software_version
 from workers.tasks import deconvolve as deconvolve_task
@@ -132,26 +130,6 @@ def test_a_built_psf_carries_its_provenance(local: InProcess, tmp_path: Path) ->
         assert hdus[0].header["PSFVERS"] == psf["version"]
         assert hdus[0].data.shape == (256, 256)
     assert (tmp_path / "psf.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_a_cancelled_job_stops_at_its_next_step(
-    local: InProcess, image_file: Path, psf_file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(attempt, "REPORT_EVERY_S", 0.0)
-    image_id, psf_id = local.upload_image(image_file)["id"], local.upload_psf(psf_file)["id"]
-    job = local.submit("deconvolve", image_id=image_id, psf_id=psf_id)
-    steps: list[int] = []
-
-    def cancel_at_five(stage: str, step: int, _steps: int) -> None:
-        steps.append(step)
-        if (stage, step) == ("deconvolving", 5):
-            local.catalogue.jobs.cancel(job["id"])
-
-    with pytest.raises(ServiceError, match="cancelled"):
-        local.wait(job, progress=cancel_at_five)
-    assert job_row(local.catalogue, job["id"]).phase == Phase.ABORTED
-    assert max(steps) == 5
-    assert local.catalogue.page(ProductRow, owner=DEFAULT_OWNER, limit=1) == []
 
 
 def test_a_transient_failure_is_retried_a_limited_number_of_times(
