@@ -1,4 +1,4 @@
-"""A request is refused for what the headers of its image and its PSF say; a deprecated PSF is not chosen, and named in warnings."""
+"""A request is refused for the ids in it and for what the headers of its image and its PSF say; deprecated PSFs."""
 
 from __future__ import annotations
 
@@ -23,10 +23,11 @@ from workers.catalogue.contexts import Pin
 from workers.catalogue.psfs import StatusAsked
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, TransitRow
 from workers.contract.identities import psf_identity
-from workers.contract.kinds import JobRequest
-from workers.contract.requests import PsfBuild, PsfFit, ResolvedDeconvolve, RichardsonLucy
+from workers.contract.kinds import JobRequest, Kind, Result
+from workers.contract.requests import Parameters, PsfBuild, PsfFit, ResolvedDeconvolve, RichardsonLucy
 from workers.intake import requests
 from workers.intake.compatibility import check, details_now, suits
+from workers.intake.requests import Asked, resolve_by_ids
 from workers.intake.uploads import image_row, uploaded_psf_row
 from workers.versions import PsfStatus
 
@@ -197,3 +198,32 @@ def test_a_fit_does_not_choose_a_diffraction_psf_that_was_deprecated(catalogue: 
     for status, version in ((PsfStatus.CERTIFIED, "1.0.0"), (PsfStatus.DEPRECATED, None)):
         catalogue.psfs.change(row.id, OWNER, StatusAsked(status, "blurred", version=version), "tester")
     assert "known_psf" in refused("psf-deprecated", lambda: requests.resolve(asked, catalogue, OWNER))
+
+
+# Ids in the parameters of any kind ------------------------------------------------------------------
+
+
+UNKNOWN = "f" * 64
+
+
+class Two(Parameters):
+    """Parameters with two PSFs, and ids that may be missing."""
+
+    psf_id: str
+    other_psf_id: str | None = None
+    reference_transit_id: str | None = None
+    no_id: str = UNKNOWN
+
+
+def resolved(catalogue: Catalogue, **parameters: str) -> Parameters:
+    kind = Kind("two", task="", result=Result.REPORT, parameters=Two, resolved=Two)
+    return resolve_by_ids(Asked(kind, Two(**parameters), catalogue, OWNER, ()))
+
+
+def test_every_id_is_checked(catalogue: Catalogue) -> None:
+    known = catalogue.add(psf("one"))[0].id
+    assert resolved(catalogue, psf_id=known, other_psf_id=known) == Two(psf_id=known, other_psf_id=known)
+    for name, code in (("other_psf_id", "no-such-psf"), ("reference_transit_id", "no-such-transit")):
+        with pytest.raises(DataError, match=UNKNOWN) as caught:
+            resolved(catalogue, **({"psf_id": known} | {name: UNKNOWN}))
+        assert caught.value.code == code
