@@ -14,6 +14,7 @@ from tests.in_process import InProcess
 from tests.tables import copied_tables
 from tests.whole.stack import Missing, postgres_database
 from tests.workers.databases import change
+from tests.workers.jobs import bench as bench
 from workers import stage_timer
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import Base

@@ -1,15 +1,26 @@
-"""Rows of jobs and bulk runs, and the leases of workers."""
+"""Rows of jobs and bulk runs, the leases of workers, and a runner of the test's own tasks."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
+
+import pytest
 
 from workers.catalogue.bulks import new_id
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
-from workers.catalogue.tables import BulkRow, JobRow
+from workers.catalogue.tables import DEFAULT_OWNER, BulkRow, JobRow
 from workers.contract.bulk import BulkPhase
+from workers.files.store import Store
+from workers.run.child import Stopping
+from workers.run.runner import Runner
+from workers.settings import Settings
+from workers.tasks.context import Context
+
+Task = Callable[[Context, Mapping[str, Any]], str]
 
 
 def job_row(catalogue: Catalogue, job_id: str) -> JobRow:
@@ -34,3 +45,27 @@ def bulk_row(owner: str, key: str = "k", *, listed: bool = True, **values: Any) 
         "running_since": time.time(),
     }  # fmt: skip
     return BulkRow(**(known | values))
+
+
+class Bench:
+    """A runner in this process, whose jobs run a task of the test's own."""
+
+    def __init__(self, folder: Path, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.catalogue, self.stopping = catalogue, Stopping()
+        self._settings = Settings(data_dir=folder / "data", heartbeat_s=0.05, broker_url="filesystem://")
+        self._monkeypatch = monkeypatch
+
+    def run(self, task: Task, on_progress: Callable[[str, int, int], None] | None = None) -> JobRow:
+        """The row of a job of this task after one attempt; a job that was handed back gets another attempt."""
+        self._monkeypatch.setattr("workers.tasks.psf_build.psf_build", task)
+        job, _ = self.catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)
+        self.catalogue.jobs.mark_submitted(job.id)
+        store = Store(self._settings.data_dir)
+        Runner(self._settings, self.catalogue, store, stopping=self.stopping).run(job.id, on_progress)
+        return job_row(self.catalogue, job.id)
+
+
+@pytest.fixture
+def bench(tmp_path: Path, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> Bench:
+    """A runner with the catalogue of the test."""
+    return Bench(tmp_path, catalogue, monkeypatch)

@@ -84,7 +84,8 @@ def test_free_memory_is_what_the_system_shows_and_the_cgroup_leaves(tmp_path: Pa
     assert 0 < free_bytes() <= memory_bytes(), "of this machine"
 
 
-def test_proxies_are_addresses_and_networks() -> None:
+def test_proxies_are_addresses_and_hosts_have_lower_case() -> None:
+    assert Settings(allowed_hosts=" Sun.Example.org , *").host_names == ("sun.example.org", "*")
     assert Settings(trusted_proxies="").proxies == ()
     given = Settings(trusted_proxies=" 127.0.0.1, 10.0.0.0/8,::1,").proxies
     assert given == ("127.0.0.1", "10.0.0.0/8", "::1")
@@ -94,13 +95,7 @@ def test_proxies_are_addresses_and_networks() -> None:
             Settings(trusted_proxies=wrong)
 
 
-def test_names_of_hosts_are_in_lower_case() -> None:
-    assert Settings(allowed_hosts=" Sun.Example.org , *").host_names == ("sun.example.org", "*")
-
-
-def test_the_largest_job_follows_from_memory_and_processes_unless_the_operator_sets_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_largest_job_follows_from_memory_and_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("workers.settings.memory_bytes", lambda: 8 * 2**30)
     monkeypatch.delenv("HELIOPSF_MAX_JOB_MEMORY_MIB", raising=False)
     assert Settings(worker_processes=1).max_job_memory_mib == 6553
@@ -109,25 +104,16 @@ def test_the_largest_job_follows_from_memory_and_processes_unless_the_operator_s
     assert Settings().max_job_memory_mib == 100_000
 
 
-def test_the_variable_names_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_cache_is_where_the_variables_say(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HELIOPSF_CACHE_DIR", str(tmp_path / "here"))
     cache = psf_cache()
     assert cache.folder == tmp_path / "here" / "psfs" and cache.max_bytes == 2**31
     assert not cache.folder.exists(), "looking must not make the folder"
-
-
-def test_without_it_the_cache_folder_of_the_user_is_used(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
     monkeypatch.delenv("HELIOPSF_CACHE_DIR")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setenv("HELIOPSF_CACHE_MIB", "3")
-    if sys.platform == "linux":
-        assert psf_cache().folder == tmp_path / "heliopsf" / "psfs"
     assert psf_cache().max_bytes == 3 * 2**20
-
-
-def test_a_size_that_is_no_number_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert sys.platform != "linux" or psf_cache().folder == tmp_path / "heliopsf" / "psfs"
     for text in ("-1", "many", "1.5", "٣"):
         monkeypatch.setenv("HELIOPSF_CACHE_MIB", text)
         with pytest.raises(DataError, match="HELIOPSF_CACHE_MIB: expected a whole number"):
@@ -145,20 +131,11 @@ def test_the_module_loads_nothing_else_of_the_workers() -> None:
     assert loaded & {"pydantic", "sqlalchemy", "numpy", "celery"} == set()
 
 
-@pytest.fixture
-def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A user without settings, in a working folder of their own."""
-    monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "home" / "my data"))
-    monkeypatch.delenv("HELIOPSF_DATA_DIR", raising=False)
-    (tmp_path / "work").mkdir()
-    monkeypatch.chdir(tmp_path / "work")
-    return tmp_path / "home"
-
-
-def test_the_catalogue_does_not_depend_on_the_working_folder(
-    home: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+def test_the_data_folder_does_not_depend_on_the_working_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "my data"))
+    monkeypatch.delenv("HELIOPSF_DATA_DIR", raising=False)
     first = Settings().data_dir
     monkeypatch.chdir(tmp_path)
-    assert first == Settings().data_dir == home / "my data" / "heliopsf"
+    assert first == Settings().data_dir == tmp_path / "my data" / "heliopsf"

@@ -9,9 +9,7 @@ from tests.workers.conftest import Clock
 from workers.stage_timer import MOST_STAGES, OTHERS, STARTING, Spent, StageTimer, short
 
 
-def test_time_before_a_step_counts_for_its_stage_and_time_before_a_beginning_for_the_previous_one(
-    clock: Clock,
-) -> None:
+def test_time_before_a_step_counts_for_its_stage(clock: Clock) -> None:
     times = StageTimer(_since=clock.now)
     for stage, step, took_s in (
         ("reading", 0, 1.0),  # the time before the first report

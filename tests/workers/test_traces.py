@@ -94,9 +94,7 @@ def test_nothing_of_opentelemetry_is_imported_by_default() -> None:
     assert output.splitlines() == ["False", "[]"]
 
 
-def test_without_the_packages_the_setting_is_an_error_that_says_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_setting_without_the_packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "opentelemetry", None)
     monkeypatch.delitem(sys.modules, "workers.trace_exporter", raising=False)
     with pytest.raises(MissingExtra, match=r"heliopsf\[traces\]"):

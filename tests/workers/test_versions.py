@@ -142,14 +142,6 @@ def test_the_nearest_of_enough_steps() -> None:
         assert interpolated_time(start, end, start) == start and interpolated_time(start, end, end) == end
 
 
-def test_the_images_of_a_day_share_a_time() -> None:
-    start, end = seconds("2022-03-01"), seconds("2023-03-01")
-    noon, evening = seconds("2022-06-01T11:00:00"), seconds("2022-05-31T13:00:00")
-    assert (
-        interpolated_time(start, end, noon) == interpolated_time(start, end, evening) == seconds("2022-06-01")
-    )
-
-
 KNOWN = ("174-open_1", "174-open_2", "174-0.984arcsec", "174-open_2-0.984arcsec")
 
 

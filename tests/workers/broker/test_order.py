@@ -12,9 +12,10 @@ import uuid
 from collections.abc import Callable, Iterator
 from copy import deepcopy
 from dataclasses import dataclass
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from queue import Empty
-from random import Random
 from typing import Any
 
 import pytest
@@ -93,9 +94,7 @@ def test_an_equal_job_that_somebody_wants_at_once_goes_up_and_never_down(catalog
     assert found.phase == "EXECUTING"
 
 
-def test_the_wait_of_a_job_that_is_submitted_over_and_over_doubles_and_ends_growing(
-    catalogue: Catalogue,
-) -> None:
+def test_the_wait_of_a_job_doubles_with_each_submission_up_to_a_limit(catalogue: Catalogue) -> None:
     catalogue.jobs.submit("psf-build", {}, "k", "o")
     for submissions, wait_s in ((1, 1e3), (2, 2e3), (8, 1.28e5), (9, 2.56e5), (40, 2.56e5)):
         for ago_s, due in ((wait_s * 0.9, False), (wait_s * 1.1, True)):
@@ -105,9 +104,7 @@ def test_the_wait_of_a_job_that_is_submitted_over_and_over_doubles_and_ends_grow
             assert bool(catalogue.jobs.unsubmitted(1e3, idle=True)) is (ago_s > 1e3), values
 
 
-def test_a_job_whose_message_is_lost_does_not_wait_long_for_workers_that_do_nothing(
-    catalogue: Catalogue, tmp_path: Path
-) -> None:
+def test_a_lost_message_is_repeated_soon_if_workers_are_idle(catalogue: Catalogue, tmp_path: Path) -> None:
     """It was submitted nine times while the queue was long. Then the broker lost the last message."""
     settings = Settings(data_dir=tmp_path / "data", broker_url="filesystem://", resubmit_s=10.0)
     app = queue.make_app(settings)
@@ -251,36 +248,24 @@ def own_message(settings: Settings) -> dict[str, Any]:
     return message
 
 
-def any_json(random: Random, depth: int = 0) -> Any:
-    """Any value of JSON."""
-    values = [None, True, 0, -1.5, 10**30, "", "text", "\ud800", "{", [], {}, {"__type__": "datetime"}]
-    if depth == 3 or random.random() < 0.6:
-        return random.choice(values)
-    inner = [any_json(random, depth + 1) for _ in range(random.randint(1, 4))]
-    return random.choice([inner, dict(zip(("task", "id", "args", "body"), inner, strict=False))])
-
-
 def hostile_messages(own: dict[str, Any]) -> Iterator[bytes]:
-    """100 messages: no JSON, any JSON, a message of the service with any body, and with any value somewhere."""
-    random = Random(49)
-    yield from (b"", b"null", b"\xff", b"[" * 100_000, b"9" * 10_000)
-    for number in range(95):
-        message = deepcopy(own)
-        if number % 3 == 0:
-            text = "null" if number == 0 else json.dumps(any_json(random))
-            message["body"] = base64.b64encode(text.encode()).decode()
-        elif number % 3 == 1:
-            properties = message["properties"]
-            parts = (message, message["headers"], properties, properties["delivery_info"])
-            part, key = random.choice([(part, key) for part in parts for key in part])
-            part[key] = any_json(random)
-        else:
-            message = any_json(random)
-        yield json.dumps(message).encode()
+    """No JSON, other JSON, and a message of the service with another value for each of its parts, and in its body."""
+    yield from (b"", b"\xff", b"[" * 100_000, b"9" * 10_000)
+    values: tuple[Any, ...] = (None, -1.5, "\ud800", [[]], {"__type__": "datetime"})
+    bodies = (base64.b64encode(json.dumps(value).encode()).decode() for value in values)
+    yield from (
+        json.dumps(message).encode() for message in (*values, *(own | {"body": body} for body in bodies))
+    )
+    for names in ((), ("headers",), ("properties",), ("properties", "delivery_info")):
+        for key in reduce(getitem, names, own):
+            for value in values:
+                message = deepcopy(own)
+                reduce(getitem, names, message)[key] = value
+                yield json.dumps(message).encode()
 
 
 def test_what_others_write_into_the_broker_stops_no_worker(broker: Broker, tmp_path: Path) -> None:
-    """100 hostile messages, and commands of Celery's remote control."""
+    """Hostile messages, and commands of Celery's remote control."""
     catalogue = Catalogue(broker.settings.catalogue_url)
     catalogue.upgrade()
     app, log = queue.make_app(broker.settings), tmp_path / "worker.log"
@@ -314,4 +299,4 @@ def test_what_others_write_into_the_broker_stops_no_worker(broker: Broker, tmp_p
             worker.kill()
             worker.wait()
         catalogue.close()
-    assert log.read_text().count("that this service did not send") > 60
+    assert log.read_text().count("that this service did not send") > 40

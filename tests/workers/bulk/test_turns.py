@@ -28,9 +28,9 @@ from workers.bulk.listing import Place
 from workers.bulk.runs import keep_turns
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
-from workers.catalogue.tables import BulkItemRow, BulkRow
+from workers.catalogue.tables import BulkItemRow
 from workers.files import archive as archive_files
-from workers.files.store import Store, open_store
+from workers.files.store import open_store
 from workers.run.runner import Runner
 from workers.settings import Settings
 from workers.tasks.context import Context
@@ -67,7 +67,7 @@ class Run:
 
     def __init__(self, api: TestClient, settings: Settings, archive: Path, psf_id: str) -> None:
         self.api, self.settings, self.archive = api, settings, archive
-        self.catalogue, self._store = Catalogue(settings.catalogue_url), Store(settings.data_dir)
+        self.catalogue, self.store = Catalogue(settings.catalogue_url), open_store(settings)
         self._psf_id = psf_id
 
     def start(self, *globs: str) -> None:
@@ -87,7 +87,7 @@ class Run:
     def turn(self) -> None:
         keep_turns(self.catalogue, self.settings)
         for job in self.catalogue.jobs.of_kind("bulk"):
-            Runner(self.settings, self.catalogue, self._store).run(job.id)
+            Runner(self.settings, self.catalogue, self.store).run(job.id)
 
     def turns(self) -> int:
         """Run turns until the run stops; returns their number."""
@@ -174,30 +174,21 @@ def after_the_first_image(monkeypatch: pytest.MonkeyPatch, act: Callable[[], Non
     return acted
 
 
+@pytest.mark.parametrize(("setting", "value"), [("LIST_AT_ONCE", 1), ("ADD_EVERY_S", 0.0)])
 def test_images_are_processed_while_further_files_are_listed(
-    run: Run, monkeypatch: pytest.MonkeyPatch
+    run: Run, monkeypatch: pytest.MonkeyPatch, setting: str, value: float
 ) -> None:
+    """Files are added when there are enough of them, or after a moment."""
     seen: list[dict[str, Any]] = []
     run.start()
     written = after_the_first_image(monkeypatch, lambda: seen.append(run.now()))
-    monkeypatch.setattr(listing, "LIST_AT_ONCE", 1)
+    monkeypatch.setattr(listing, setting, value)
     looked = at_folder(monkeypatch, run.archive, "1", lambda: _must_be_set(written))
     assert run.turns() == 1
     (during,) = seen
     assert (during["phase"], during["listed"], during["time_left_s"]) == ("LISTING", False, None)
     assert during["images"]["total"] == IN_FOLDER, "as many as are listed"
     assert looked == ["archive", "0", "1", "2"]
-    run.check_all_done_once()
-
-
-def test_first_images_are_added_after_a_moment_even_if_they_are_few(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run.start()
-    written = after_the_first_image(monkeypatch, lambda: None)
-    monkeypatch.setattr(listing, "ADD_EVERY_S", 0.0)
-    at_folder(monkeypatch, run.archive, "1", lambda: _must_be_set(written))
-    run.turns()
     run.check_all_done_once()
 
 
@@ -214,45 +205,7 @@ def test_a_search_that_was_stopped_at_every_step_finds_each_file_once(run: Run) 
     run.check_listed_once()
 
 
-def test_a_worker_that_is_lost_while_it_lists_is_followed_by_another(run: Run) -> None:
-    run.start()
-    lost = run.lease()
-    begun = _list_first_folder(run, lost)
-    partly = run.now()
-    assert (partly["phase"], partly["listed"]) == ("LISTING", False) and 0 < partly["images"]["total"] < ALL
-    run.catalogue.jobs.give_up_silent(-1.0, 99)
-    run.turns()
-    listing.list_files(_context(run, lost), begun, lambda: None, lambda: False)  # it comes back too late
-    run.check_all_done_once()
-
-
-def test_a_run_that_was_paused_while_it_lists_continues_where_it_was(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run.start()
-    monkeypatch.setattr(listing, "LIST_AT_ONCE", 1)
-    paused = after_the_first_image(monkeypatch, lambda: run.change("pause"))
-    looked = at_folder(monkeypatch, run.archive, "2", lambda: _must_be_set(paused))
-    run.turn()
-    stopped = run.now()
-    assert (stopped["phase"], stopped["listed"], stopped["images"]["total"]) == (
-        "PAUSED",
-        False,
-        2 * IN_FOLDER,
-    )
-    assert 1 <= stopped["images"]["done"] <= 2 * IN_FOLDER and stopped["images"]["at_work"] == 0
-    run.turn()
-    assert run.now() == stopped, "a paused run does nothing"
-    before = len(looked)
-    run.change("resume")
-    run.turns()
-    assert looked[before:] == ["archive", "1", "2"], "a folder that was listed is not read again"
-    run.check_all_done_once()
-
-
-def test_a_listing_that_fails_midway_keeps_what_is_done_and_continues_when_resumed(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_listing_that_failed_continues_when_resumed(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken() -> None:
         raise ZeroDivisionError
 
@@ -266,7 +219,7 @@ def test_a_listing_that_fails_midway_keeps_what_is_done_and_continues_when_resum
     keep_turns(run.catalogue, run.settings)
     assert (run.now()["phase"], run.now()["error"]["code"]) == ("ERROR", "internal-error")
     run.change("resume")
-    at_folder(monkeypatch, run.archive, "1", unreadable)
+    looked = at_folder(monkeypatch, run.archive, "1", unreadable)
     run.turn()
     failed = run.now()
     assert (failed["phase"], failed["listed"]) == ("ERROR", False)
@@ -275,12 +228,11 @@ def test_a_listing_that_fails_midway_keeps_what_is_done_and_continues_when_resum
     assert "at least 2" in run.api.get(f"/bulk/{run.id}", headers={"Accept": "text/html"}).text
     run.change("resume")
     run.turns()
+    assert looked == ["archive", "0", "1", "archive", "1", "2"], "a listed folder is not read again"
     run.check_all_done_once()
 
 
-def test_a_run_that_is_cancelled_while_it_finds_nothing_stops_at_once(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_cancelled_while_it_finds_nothing_stops(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("workers.run.attempt.REPORT_EVERY_S", 0.0)
     monkeypatch.setattr(listing, "ADD_EVERY_S", 0.0)
     run.start("**/*.none")
@@ -290,9 +242,7 @@ def test_a_run_that_is_cancelled_while_it_finds_nothing_stops_at_once(
     assert {job.phase for job in run.catalogue.jobs.of_kind("bulk")} <= {"ABORTED", "COMPLETED"}
 
 
-def test_a_listing_that_finds_nothing_lets_other_jobs_go_first(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_listing_lets_other_jobs_go_first(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """A search of a large archive must not keep a worker from the jobs of people."""
     run.start("**/*.none")
     handed_back, submit = [], lambda: run.catalogue.jobs.submit("psf-build", {}, "k", "somebody") and None
@@ -317,9 +267,7 @@ def test_a_listing_that_finds_nothing_lets_other_jobs_go_first(
     assert (now["phase"], now["images"]["total"]) == ("LISTING", 0)
 
 
-def test_as_many_turns_as_workers_process_images_while_one_lists(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_other_turns_process_images_while_one_lists(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     run.start()
     monkeypatch.setattr(type(run.catalogue.census), "workers", lambda *_: [object()] * 3)
     lease = run.lease()
@@ -327,7 +275,7 @@ def test_as_many_turns_as_workers_process_images_while_one_lists(
     keep_turns(run.catalogue, run.settings)
     others = [job for job in run.catalogue.jobs.of_kind("bulk") if job.id != lease.job_id]
     assert len(others) == IN_FOLDER - 1
-    Runner(run.settings, run.catalogue, Store(run.settings.data_dir)).run(others[0].id)
+    Runner(run.settings, run.catalogue, run.store).run(others[0].id)
     now = run.now()
     assert (now["phase"], now["images"]["done"], now["images"]["waiting"]) == ("LISTING", IN_FOLDER, 0)
 
@@ -351,9 +299,7 @@ def number_of(ready: Any) -> int:
     return int(ready.image.pixels.shape[0]) - 64
 
 
-def test_the_next_image_is_read_and_the_last_product_written_while_an_image_is_computed(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_reading_computing_and_writing_overlap(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     run.start_uploaded()
     read, written = ([threading.Event() for _ in range(5)] for _ in range(2))
     computing = threading.Event()
@@ -459,54 +405,44 @@ def test_files_of_equal_content_are_computed_once(run: Run, monkeypatch: pytest.
 
 
 def test_a_local_copy_removed_during_a_wait_is_downloaded_again(
-    tmp_path: Path, image_file: Path, psf_file: Path, monkeypatch: pytest.MonkeyPatch
+    settings: Settings, archive: Path, psf_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with s3_bucket(monkeypatch, shared_server()) as (url, _):
-        data = {"data_dir": tmp_path / "data", "store_url": url}
-        settings = Settings.model_validate(
-            data | {"broker_url": "filesystem://", "allowed_hosts": "testserver"}
-        )
+        settings = settings.model_copy(update={"store_url": url})
         with TestClient(create_app(settings)) as api:
-            image_id, psf_id = upload(api, image_file), upload(api, psf_file, "/v1/psfs")
-            few = {"method": {"name": "richardson-lucy", "steps": 1}}
-            body = {"kind": "deconvolve", "parameters": {"image_id": image_id, "psf_id": psf_id, **few}}
-            job = api.post("/v1/jobs", json=body).json()
-            request = {"images": [image_id], "psf_id": psf_id, "parameters": few}
-            bulk = api.post("/v1/bulk", json=request).json()
-        catalogue = Catalogue(settings.catalogue_url)
-        lease = claimed(catalogue, job["id"], "another")
-        (copy,) = (path for path in tmp_path.rglob(image_id) if path.is_file())
+            psf_id = upload(api, psf_file, "/v1/psfs")
+            run = Run(api, settings, archive, psf_id)
+            run.start_uploaded()
+            parameters = {"image_id": run.images[0], "psf_id": psf_id, **FEW}
+            job = api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": parameters}).json()
+            lease = claimed(run.catalogue, job["id"], "another")
+            (copy,) = (path for path in settings.data_dir.rglob(run.images[0]) if path.is_file())
 
-        def rest(_seconds: float) -> None:
-            copy.unlink()
-            assert catalogue.jobs.requeue(lease)
+            def rest(_seconds: float) -> None:
+                copy.unlink()
+                assert run.catalogue.jobs.requeue(lease)
 
-        clock = SimpleNamespace(time=time.time, monotonic=time.monotonic, sleep=rest)
-        monkeypatch.setattr(bulk_image, "time", clock)
-        keep_turns(catalogue, settings)
-        (turn,) = catalogue.jobs.of_kind("bulk")
-        Runner(settings, catalogue, open_store(settings)).run(turn.id)
-        row = catalogue.bulks.get(bulk["id"])
-        assert row is not None and (row.done, row.failed) == (1, 0)
-        assert copy.is_file()
-        catalogue.close()
+            clock = SimpleNamespace(time=time.time, monotonic=time.monotonic, sleep=rest)
+            monkeypatch.setattr(bulk_image, "time", clock)
+            run.turn()
+            assert run.rows()[0].state == "done" and copy.is_file()
+            run.catalogue.close()
 
 
 def _must_be_set(event: threading.Event) -> None:
     assert event.wait(WAIT_S), "no image was processed while files are listed"
 
 
-def _list_first_folder(run: Run, lease: Lease) -> BulkRow:
-    """The run as it was before the top, its folders, a folder and its files were listed."""
+def _list_first_folder(run: Run, lease: Lease) -> None:
+    """List the top, its folders, a folder and its files."""
     begun = run.catalogue.bulks.begin_listing(run.id, lease)
     assert begun is not None
     steps = iter([False] * (1 + FOLDERS + IN_FOLDER) + [True])
     listing.list_files(_context(run, lease), begun, lambda: None, lambda: next(steps))
-    return begun
 
 
 def _context(run: Run, lease: Lease) -> Context:
     return Context(
-        catalogue=run.catalogue, store=Store(run.settings.data_dir), settings=run.settings, owner="local",
+        catalogue=run.catalogue, store=run.store, settings=run.settings, owner="local",
         job_id="j", report=lambda *_: None, lease=lease,
     )  # fmt: skip

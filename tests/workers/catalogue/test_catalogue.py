@@ -1,7 +1,8 @@
-"""The phases of a job's row: who may change it, when, and what happens if the worker is lost."""
+"""The phases of a job's row: who may change it, when, if the worker is lost, and jobs that make the same."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -22,8 +23,12 @@ from workers.contract.jobs import Fault, JobError, Phase
 BROKEN = JobError(fault=Fault.INTERNAL, code="broken", message="broken")
 
 
+def asked_for(catalogue: Catalogue, key: str = "k") -> tuple[JobRow, bool]:
+    return catalogue.jobs.submit("psf-build", {"key": key}, key, DEFAULT_OWNER)
+
+
 def submitted(catalogue: Catalogue, key: str = "k") -> JobRow:
-    return catalogue.jobs.submit("psf-build", {"instrument": "hri_euv"}, key, DEFAULT_OWNER)[0]
+    return asked_for(catalogue, key)[0]
 
 
 def at_work(catalogue: Catalogue, key: str = "k") -> tuple[JobRow, Lease]:
@@ -31,11 +36,9 @@ def at_work(catalogue: Catalogue, key: str = "k") -> tuple[JobRow, Lease]:
     return job, claimed(catalogue, job.id)
 
 
-def test_an_equal_request_shares_the_live_job_and_after_a_failure_makes_a_new_one(
-    catalogue: Catalogue,
-) -> None:
+def test_an_equal_request_shares_a_live_job_and_no_failed_one(catalogue: Catalogue) -> None:
     job, lease = at_work(catalogue)
-    second, new = catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)
+    second, new = asked_for(catalogue)
     assert second.id == job.id and not new
     assert catalogue.jobs.fail(lease, BROKEN)
     assert submitted(catalogue).id != job.id
@@ -43,11 +46,15 @@ def test_an_equal_request_shares_the_live_job_and_after_a_failure_makes_a_new_on
 
 @BOTH
 def test_many_equal_requests_at_once_make_one_job(catalogue: Catalogue) -> None:
-    with ThreadPoolExecutor(8) as pool:
-        several = (pool.submit(catalogue.jobs.submit, "psf-build", {}, "k", DEFAULT_OWNER) for _ in range(16))
-        answers = [one.result() for one in list(several)]
-    assert len({row.id for row, _ in answers}) == 1
-    assert sum(new for _, new in answers) == 1
+    made: set[str] = set()
+    for jobs in (1, 2):
+        with ThreadPoolExecutor(8) as pool:
+            answers = list(pool.map(lambda _: catalogue.jobs.submit("psf-build", {}, "k", "o"), range(16)))
+        assert len({row.id for row, _ in answers}) == sum(new for _, new in answers) == 1
+        made.add(answers[0][0].id)
+        assert len(made) == jobs, "a job that was told to stop is not shared"
+        catalogue.jobs.claim(answers[0][0].id, "w")
+        catalogue.jobs.cancel(answers[0][0].id)
 
 
 @BOTH
@@ -93,9 +100,7 @@ def test_cancelling_in_each_phase(catalogue: Catalogue) -> None:
 
 
 @BOTH
-def test_a_silent_worker_loses_its_job_and_the_third_loss_ends_it(
-    catalogue: Catalogue, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_the_third_silent_worker_ends_a_job(catalogue: Catalogue, caplog: pytest.LogCaptureFixture) -> None:
     job, lease = at_work(catalogue)
     assert catalogue.jobs.give_up_silent(60, 3) == []
     for attempt in (1, 2):
@@ -109,33 +114,6 @@ def test_a_silent_worker_loses_its_job_and_the_third_loss_ends_it(
     assert row.error is not None and row.error["code"] == "worker-lost"
     (line,) = [record for record in caplog.records if record.levelname == "ERROR"]
     assert job.id in line.getMessage() and "lost 3 times" in line.getMessage()
-
-
-WAIT_S = 1000.0  # a test moves the recorded time back and does not wait
-
-
-def waiting(catalogue: Catalogue) -> list[str]:
-    return [job_id for job_id, _ in catalogue.jobs.unsubmitted(WAIT_S)]
-
-
-def age(catalogue: Catalogue, job: JobRow) -> None:
-    """Move the job's submission back by 1.1 waits."""
-    earlier = update(JobRow).values(submitted_at=JobRow.submitted_at - 1.1 * WAIT_S)
-    change(catalogue, earlier.where(JobRow.id == job.id))
-
-
-def test_a_lost_message_is_submitted_again_after_a_wait(catalogue: Catalogue) -> None:
-    job = submitted(catalogue)
-    assert waiting(catalogue) == [job.id]
-    catalogue.jobs.mark_submitted(job.id)
-    assert waiting(catalogue) == []
-    age(catalogue, job)
-    assert waiting(catalogue) == [job.id]
-    catalogue.jobs.mark_submitted(job.id)
-    age(catalogue, job)
-    assert waiting(catalogue) == [], "the wait doubles"
-    age(catalogue, job)
-    assert waiting(catalogue) == [job.id]
 
 
 def test_a_product_is_kept_once_and_pages_hold_every_row_newest_first(catalogue: Catalogue) -> None:
@@ -181,9 +159,7 @@ ENDS_OF_AN_ATTEMPT: dict[str, Callable[[Catalogue, Lease], object]] = {
 }
 
 
-def test_a_cancel_is_not_lost_where_the_attempt_ends_meanwhile(
-    catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_cancel_while_an_attempt_ends(catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
     for end, act in ENDS_OF_AN_ATTEMPT.items():
         for transactions in (0, 1):
             job, lease = at_work(catalogue, f"{end} {transactions}")
@@ -194,12 +170,11 @@ def test_a_cancel_is_not_lost_where_the_attempt_ends_meanwhile(
                 act(catalogue, lease)
             row = job_row(catalogue, job.id)
             assert row.phase == Phase.ABORTED, (end, transactions)
-            assert row.ended_at is not None and row.cancel_requested
+            assert row.ended_at is not None and row.cancel_requested and row.lease is None
+    assert catalogue.jobs.unsubmitted(0.0) == [] and catalogue.jobs.claim(job.id, "other") is None
 
 
-def test_a_cancel_is_not_lost_while_silent_workers_are_given_up(
-    catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_cancel_while_workers_are_given_up(catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
     for transactions in (0, 1, 2):
         job, _ = at_work(catalogue, str(transactions))
         with monkeypatch.context() as patched:
@@ -211,25 +186,6 @@ def test_a_cancel_is_not_lost_while_silent_workers_are_given_up(
         else:
             assert back == []
         assert job_row(catalogue, job.id).phase == Phase.ABORTED
-
-
-def test_a_cancelled_job_is_not_tried_again(catalogue: Catalogue) -> None:
-    silent, _ = at_work(catalogue, "silent")
-    catalogue.jobs.cancel(silent.id)
-    assert (
-        catalogue.jobs.give_up_silent(-1.0, 1) == [] and job_row(catalogue, silent.id).phase == Phase.ABORTED
-    )
-    job, lease = at_work(catalogue)
-    assert catalogue.jobs.requeue(lease)
-    row = job_row(catalogue, job.id)
-    assert (row.phase, row.ended_at, row.lease) == (Phase.QUEUED, None, None)
-    again = claimed(catalogue, job.id, "me")
-    catalogue.jobs.cancel(job.id)
-    assert catalogue.jobs.requeue(again), "the attempt's end is written"
-    row = job_row(catalogue, job.id)
-    assert row.phase == Phase.ABORTED
-    assert row.ended_at is not None and row.lease is None
-    assert waiting(catalogue) == [] and catalogue.jobs.claim(job.id, "other") is None
 
 
 def test_a_job_that_counts_several_times_is_told_by_its_estimated_time() -> None:
@@ -244,9 +200,7 @@ def test_a_job_that_counts_several_times_is_told_by_its_estimated_time() -> None
     assert share_of_time(counted, 1015.0) is None
 
 
-def test_the_beginning_of_each_count_of_steps_is_kept(
-    catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_each_count_of_steps_has_its_own_pace(catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
     """Reading 5 images takes 250 s; then each of 11 steps takes 1 s."""
     now = [1000.0]
     monkeypatch.setattr(Database, "now", property(lambda _: literal_column(f"{now[0]!r}", Double)))
@@ -269,3 +223,109 @@ def test_the_beginning_of_each_count_of_steps_is_kept(
     assert catalogue.jobs.claim(lease.job_id, "other") is not None
     row = job_row(catalogue, lease.job_id)
     assert row.count_at is None and time_left_s(row, now[0]) is None
+
+
+# Jobs that make the same: one is at work at a time --------------------------------------------------
+
+
+def started(catalogue: Catalogue, key: str = "k", owner: str = DEFAULT_OWNER) -> str:
+    """The id of a job of a UWS client's that was told to run."""
+    draft = catalogue.uws.draft("psf-build", {}, owner=owner)
+    assert catalogue.uws.start(draft.id, {}, {"key": key}, key)
+    return draft.id
+
+
+def claim(catalogue: Catalogue, job_id: str) -> Lease | None:
+    return catalogue.jobs.claim(job_id, "w")
+
+
+def waiting(catalogue: Catalogue) -> set[str]:
+    return {job_id for job_id, _ in catalogue.jobs.unsubmitted(3600.0)}
+
+
+@BOTH
+def test_of_equal_jobs_that_are_claimed_at_one_moment_one_is_at_work(catalogue: Catalogue) -> None:
+    for others in (started(catalogue, key="other"), started(catalogue, owner="somebody")):
+        assert claim(catalogue, others) is not None
+    jobs = [started(catalogue) for _ in range(8)]
+    catalogue.jobs.mark_submitted(*jobs)
+    with ThreadPoolExecutor(8) as pool:
+        leases = list(pool.map(lambda job: claim(catalogue, job), jobs))
+    assert sum(lease is not None for lease in leases) == 1
+    phases = sorted(job_row(catalogue, job).phase for job in jobs)
+    assert phases == [Phase.EXECUTING] + 7 * [Phase.QUEUED]
+    assert waiting(catalogue) == set(), "none is given to the broker in vain"
+    assert not catalogue.jobs.others_wait("bulk"), "and a bulk does not make way for them"
+    assert catalogue.census.count_unsubmitted(-1.0) == 0, "nor does an operator have to look after them"
+    assert all(
+        job_row(catalogue, job).attempt == 0 for job, lease in zip(jobs, leases, strict=True) if not lease
+    )
+
+
+ENDS: dict[str, Callable[[Catalogue, Lease], object]] = {
+    "complete": lambda catalogue, lease: catalogue.jobs.complete(lease, "r"),
+    "fail": lambda catalogue, lease: catalogue.jobs.fail(lease, BROKEN),
+    "requeue": lambda catalogue, lease: catalogue.jobs.requeue(lease),
+    "hand back": lambda catalogue, lease: catalogue.jobs.hand_back(lease),
+    "destroy": lambda catalogue, lease: catalogue.uws.destroy(lease.job_id),
+    "silent": lambda catalogue, lease: catalogue.jobs.give_up_silent(-1.0, 3) == [lease.job_id],
+}  # fmt: skip
+
+
+@BOTH
+def test_once_it_is_no_longer_at_work_the_next_may_be(catalogue: Catalogue) -> None:
+    for name, end in ENDS.items():
+        first, second = started(catalogue, name), started(catalogue, name)
+        catalogue.jobs.mark_submitted(first, second)
+        lease = claim(catalogue, first)
+        assert lease is not None and claim(catalogue, second) is None
+        assert end(catalogue, lease), name
+        assert second in waiting(catalogue)
+        last = claim(catalogue, second)
+        assert last is not None and catalogue.jobs.complete(last, "r"), name
+        catalogue.jobs.cancel(first)
+
+
+def test_a_job_that_was_told_to_stop_is_not_shared(catalogue: Catalogue) -> None:
+    doomed, lease = at_work(catalogue)
+    for _ in range(2):  # the second cancel does not reach a third request
+        catalogue.jobs.cancel(doomed.id)
+        again, new = asked_for(catalogue)
+        assert new and again.id != doomed.id and (again.phase, again.work_key) == (Phase.QUEUED, "k")
+        doomed = again
+    shared, new = asked_for(catalogue)
+    assert shared.id == again.id and not new, "requests after it share the new one"
+    assert claim(catalogue, again.id) is None and waiting(catalogue) == set(), "one is at work at a time"
+    assert catalogue.jobs.abort(lease)
+    assert job_row(catalogue, again.id).phase == Phase.QUEUED and waiting(catalogue) == {again.id}
+    late, lease = at_work(catalogue, "late")
+    catalogue.jobs.cancel(late.id)
+    assert catalogue.jobs.complete(lease, "r"), "it was done before it could stop"
+    shared, new = asked_for(catalogue, "late")
+    assert shared.id == late.id and not new
+
+
+@pytest.mark.parametrize("end", ["too long", "destroyed"])
+def test_a_job_that_ends_on_terms_is_not_shared(catalogue: Catalogue, end: str) -> None:
+    limited = started(catalogue)
+    other, new = asked_for(catalogue)
+    assert new and other.id != limited and other.work_key == "k"
+    assert asked_for(catalogue)[0].id == other.id
+    lease = claim(catalogue, limited)
+    assert lease is not None and claim(catalogue, other.id) is None
+    if end == "too long":
+        catalogue.uws.set_terms(limited, execution_duration_s=1)
+        change(catalogue, update(JobRow).values(started_at=JobRow.started_at - 1.1))
+        assert catalogue.uws.end_by_terms() == [] and catalogue.jobs.abort(lease)
+    else:
+        catalogue.uws.set_terms(limited, destruction_at=time.time() - 1)
+        assert catalogue.uws.end_by_terms() == [limited]
+    assert (
+        job_row(catalogue, other.id).phase == Phase.QUEUED
+        and not job_row(catalogue, other.id).cancel_requested
+    )
+    assert claim(catalogue, other.id) is not None
+    given = asked_for(catalogue, "given")[0].id
+    catalogue.uws.set_terms(given, execution_duration_s=1)
+    later, new = asked_for(catalogue, "given")
+    assert new and later.id != given and asked_for(catalogue, "given")[0].id == later.id

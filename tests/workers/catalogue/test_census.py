@@ -1,33 +1,28 @@
-"""Counts of files and jobs, and stage times: sums over attempts; a failure to store them changes no job's outcome."""
+"""Counts of files and jobs, stage times, and what streams read of an owner's jobs and bulk runs."""
 
 from __future__ import annotations
 
-import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy import text
+from sqlalchemy import insert, text
 
 from psfcore.errors import DataError
-from tests.workers.conftest import Clock
-from tests.workers.databases import BOTH, change
-from tests.workers.jobs import claimed, job_row
+from tests.whole.many_rows import plan, statements
+from tests.workers.databases import BOTH, change, database
+from tests.workers.jobs import Bench, bulk_row, claimed
 from tests.workers.psf_examples import psf
+from workers.catalogue import followed
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.census import FileTally
+from workers.catalogue.followed import Place
 from workers.catalogue.tables import DEFAULT_OWNER, ImageRow, JobRow
 from workers.contract.jobs import Phase
-from workers.files.store import Store
-from workers.run.runner import Runner
-from workers.settings import Settings
-from workers.stage_timer import STARTING, Spent
+from workers.stage_timer import Spent
 from workers.tasks.context import Context
-
-Task = Callable[[Context, Mapping[str, Any]], str]
 
 
 def test_the_counts_of_files_and_jobs(catalogue: Catalogue) -> None:
@@ -67,40 +62,6 @@ def test_times_of_many_attempts_are_summed(catalogue: Catalogue) -> None:
     }
 
 
-def run(folder: Path, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch, task: Task) -> JobRow:
-    """The row of a job of this task after an attempt."""
-    settings = Settings(data_dir=folder / "data", broker_url="filesystem://")
-    monkeypatch.setattr("workers.tasks.psf_build.psf_build", task)
-    job, _ = catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)
-    Runner(settings, catalogue, Store(settings.data_dir)).run(job.id)
-    return job_row(catalogue, job.id)
-
-
-def test_an_attempt_stores_its_stages_without_the_time_of_writing(
-    tmp_path: Path, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch, clock: Clock
-) -> None:
-    written = catalogue.jobs.progress
-
-    def slowly(*given: Any) -> bool:
-        clock.now += 1000.0
-        return written(*given)
-
-    def works(context: Context, _: Mapping[str, Any]) -> str:
-        for step in range(4):
-            clock.now += 2.0 * (step > 0)
-            context.report("at work: on something", step, 3)
-        return "result"
-
-    monkeypatch.setattr(catalogue.jobs, "progress", slowly)
-    job = run(tmp_path, catalogue, monkeypatch, works)
-    assert job.phase == Phase.COMPLETED
-    times = catalogue.stage_times.all()
-    assert set(times) == {("psf-build", STARTING), ("psf-build", "at work")}
-    assert times["psf-build", "at work"] == Spent(pytest.approx(6.0), 3)
-    catalogue.uws.destroy(job.id)
-    assert catalogue.stage_times.all() == times
-
-
 def fails(context: Context, _: Mapping[str, Any]) -> str:
     context.report("at work", 1, 2)
     raise DataError("bad", "no good")
@@ -116,19 +77,100 @@ def works(context: Context, _: Mapping[str, Any]) -> str:
     return "result"
 
 
-@pytest.mark.parametrize(("task", "phase"), [(fails, Phase.ERROR), (passing, Phase.QUEUED)])
-def test_failed_attempts_count_too(
-    tmp_path: Path, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch, task: Task, phase: Phase
+def test_the_stages_of_every_attempt_count_also_after_its_job_was_deleted(
+    catalogue: Catalogue, bench: Bench
 ) -> None:
-    assert run(tmp_path, catalogue, monkeypatch, task).phase == phase
-    assert catalogue.stage_times.all()["psf-build", "at work"].steps == 1
+    for number, (task, phase) in enumerate(
+        ((works, Phase.COMPLETED), (fails, Phase.ERROR), (passing, Phase.QUEUED)), 1
+    ):
+        job = bench.run(task)
+        assert job.phase == phase
+        catalogue.uws.destroy(job.id)
+        assert catalogue.stage_times.all()["psf-build", "at work"].steps == number
 
 
 def test_a_job_ends_normally_if_its_times_cannot_be_stored(
-    tmp_path: Path, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    catalogue: Catalogue, bench: Bench, caplog: pytest.LogCaptureFixture
 ) -> None:
     change(catalogue, text("ALTER TABLE stage_times RENAME TO elsewhere"))
-    with caplog.at_level(logging.WARNING, "workers.run.runner"):
-        job = run(tmp_path, catalogue, monkeypatch, works)
+    job = bench.run(works)
     assert (job.phase, job.result_id) == (Phase.COMPLETED, "result")
     assert "could not keep its stage times" in caplog.text
+
+
+# What streams read ----------------------------------------------------------------------------------
+
+
+ANY = "0" * 32
+
+
+def job(number: int, owner: str = "ann", **values: object) -> dict[str, object]:
+    key = f"{number:064x}"
+    return {
+        "id": f"{number:032x}", "owner": owner, "kind": "psf-build", "parameters": {}, "request_key": key, "work_key": key,
+        "phase": "COMPLETED", "created_at": float(number), "ended_at": float(number), **values,
+    }  # fmt: skip
+
+
+def add_jobs(catalogue: Catalogue, *jobs: dict[str, object]) -> None:
+    change(catalogue, *(insert(JobRow).values(**one) for one in jobs))
+
+
+def test_rows_are_read_by_owner_phase_and_end(catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(followed, "MOST", 2)
+    add_jobs(
+        catalogue,
+        *(job(number) for number in (1, 2, 3, 4)),
+        *(job(number, phase="QUEUED", ended_at=None) for number in (5, 6, 7)),
+        job(8, phase="EXECUTING", ended_at=None),
+        job(9, "bob"),
+        job(10, "bob", phase="EXECUTING", ended_at=None),
+        job(11, kind="bulk", phase="EXECUTING", ended_at=None),
+        job(12, phase="PENDING", ended_at=None),
+    )
+    jobs = catalogue.followed_jobs
+    assert [int(one.id, 16) for one in jobs.open("ann")] == [8, 7, 6], "two of each phase, newest first"
+    assert [int(one.id, 16) for one in jobs.ended("ann", Place(2.0))] == [2, 3]
+    assert [int(one.id, 16) for one in jobs.ended("ann", Place(3.0, f"{3:032x}"))] == [4]
+    asked = [f"{number:032x}" for number in (1, 9, 11, 12, 99)]
+    assert sorted(int(one.id, 16) for one in jobs.among("ann", asked)) == [1, 12]
+    assert jobs.among("ann", []) == [] and jobs.rows("ann", []) == {}
+    found = jobs.rows("ann", asked)
+    assert {one: state for one, (state, _) in found.items()} == {
+        state.id: state for state in jobs.among("ann", asked)
+    }
+    assert jobs.now() == pytest.approx(time.time(), abs=5)
+
+
+def test_open_bulk_runs_are_followed_also_when_paused(catalogue: Catalogue) -> None:
+    ids = []
+    for number in range(3):
+        row = bulk_row("ann", str(number), created_at=float(number))
+        ids.append(catalogue.bulks.create(row, ["a" * 64])[0].id)
+    catalogue.bulks.pause(ids[0])
+    catalogue.bulks.cancel(ids[1])
+    bulks = catalogue.followed_bulks
+    assert [one.id for one in bulks.open("ann")] == [ids[2], ids[0]] and bulks.open("bob") == []
+    assert [one.id for one in bulks.ended("ann", Place(time.time() - 60))] == [ids[1]]
+
+
+@BOTH
+def test_every_query_uses_an_index_on_what_it_asks_for(catalogue: Catalogue) -> None:
+    """With many ended jobs, and the statistics of PostgreSQL: no query reads all jobs of the owner."""
+    with database(catalogue).engine.begin() as connection:
+        connection.execute(insert(JobRow), [job(number) for number in range(2000)])
+    with database(catalogue).engine.execution_options(isolation_level="AUTOCOMMIT").connect() as connection:
+        connection.execute(text("ANALYZE"))
+    jobs = catalogue.followed_jobs
+    with statements() as sent:
+        jobs.ended("ann", Place(1990.0)), jobs.open("ann"), jobs.among("ann", [ANY]), jobs.rows("ann", [ANY])
+    plans = [
+        "\n".join(plan(database(catalogue), *one, forced=False))
+        for one in sent
+        if one[0].startswith("SELECT")
+    ]
+    ended, executing, queued, among, read = plans
+    assert "jobs_ended" in ended and "ended_at" in ended
+    assert all("USING INDEX jobs_" in one or "Index Scan" in one for one in (executing, queued)), plans
+    assert not any("SCAN jobs" in one or "Seq Scan" in one for one in plans), plans
+    assert all("id" in one for one in (among, read))

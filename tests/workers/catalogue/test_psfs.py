@@ -175,16 +175,6 @@ def test_of_certifications_at_once_one_wins(catalogue: Catalogue) -> None:
     assert sorted(ended) == ["done"] + ["ranges-overlap"] * 5
     (row,) = catalogue.psfs.page(PsfFilter(status="certified"), OWNER, limit=10)
     assert [change.status for change in catalogue.psfs.changes(row.id, OWNER)] == ["certified"]
-    drafts = [name for name in names if status(catalogue, name) == "draft"]
-    for name in drafts:
-        catalogue.add(psf(f"far {name}", channel="304"))
-    ended = together(
-        *(
-            lambda n=n, name=name: certify(catalogue, f"far {name}", "1.0.0", years(2000 + n, 2001 + n))
-            for n, name in enumerate(drafts)
-        )
-    )
-    assert sorted(ended) == ["done"] + ["version-taken"] * 4, "one gets the version"
 
 
 @BOTH

@@ -75,9 +75,7 @@ def said(caplog: pytest.LogCaptureFixture) -> list[str]:
     return [record.message for record in caplog.records if record.name == "workers.catalogue.schema"]
 
 
-def test_an_empty_database_gets_the_tables_that_the_code_works_with(
-    catalogue: Catalogue, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_an_empty_database_gets_its_tables(catalogue: Catalogue, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "workers.catalogue.schema")
     with pytest.raises(SchemaError, match="it is empty: upgrade it with `heliopsf database upgrade`"):
         catalogue.schema.check()

@@ -59,9 +59,7 @@ def test_the_single_job_of_one_owner_comes_before_the_many_of_another(catalogue:
     assert served(catalogue, messages[:3]) == ["many", "one", "many"]
 
 
-def test_an_owner_with_a_long_job_is_not_kept_waiting_by_the_many_short_ones_of_another(
-    catalogue: Catalogue,
-) -> None:
+def test_an_owner_with_a_long_job_gets_its_turn_too(catalogue: Catalogue) -> None:
     (long,) = submitted(catalogue, "long")
     assert owner_of(catalogue, next_one(catalogue, long)) == "long"  # it runs until the end of the test
     many = submitted(catalogue, "many", 10)
@@ -152,9 +150,7 @@ def test_a_job_that_waits_for_an_equal_one_gets_another_message(catalogue: Catal
     assert [job_id for job_id, _ in catalogue.jobs.unsubmitted(3600.0)] == [draft.id]
 
 
-def test_a_stopping_worker_leaves_a_job_that_is_submitted_again(
-    catalogue: Catalogue, settings: Settings
-) -> None:
+def test_a_job_that_a_stopping_worker_leaves(catalogue: Catalogue, settings: Settings) -> None:
     jobs = submitted(catalogue, "me", 2)
     assert next_one(catalogue, jobs[1]) is not None
     stopping = Stopping()
@@ -213,6 +209,7 @@ def test_places_are_those_in_which_the_jobs_start(catalogue: Catalogue, seed: in
     told = {job: before(catalogue, job) for job in jobs}
     order = started(catalogue, len(jobs))
     assert len(order) == 12 and told == {job: place for place, job in enumerate(order)}
+    assert before(catalogue, order[0]) is None, "only a waiting job has a place"
 
 
 def test_a_new_job_has_the_place_that_it_is_told_beforehand(catalogue: Catalogue) -> None:
@@ -224,13 +221,6 @@ def test_a_new_job_has_the_place_that_it_is_told_beforehand(catalogue: Catalogue
         row, _ = catalogue.jobs.submit("psf-build", {}, f"{owner} {queue} new", owner, queue=queue)
         assert catalogue.places.before(row) == told
     assert catalogue.places.before_new("nobody", Queue.CROSSVAL) == 9, "the nine of the more urgent queue"
-
-
-def test_only_a_waiting_job_has_a_place(catalogue: Catalogue) -> None:
-    first, second = submitted(catalogue, "ann", 2)
-    assert (before(catalogue, first), before(catalogue, second)) == (0, 1)
-    assert catalogue.turns.claim_next(first, HERE, "w") is not None
-    assert (before(catalogue, first), before(catalogue, second)) == (None, 0)
 
 
 def test_no_more_than_the_limit_is_counted(catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -157,9 +157,7 @@ VERSIONS: dict[type[Parameters], int] = {
 }
 
 
-def test_identities_of_existing_results_do_not_change_until_a_version_is_raised(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_identities_do_not_change_until_a_version_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(identities, "library_sha256", lambda: A)
     for model, version in VERSIONS.items():
         monkeypatch.setattr(model, "algorithm_version", version)
@@ -170,9 +168,7 @@ def test_identities_of_existing_results_do_not_change_until_a_version_is_raised(
             assert [compute()[:16] for compute, _ in FROZEN] != [frozen for _, frozen in FROZEN], model
 
 
-def test_a_changed_library_of_effects_changes_the_identity_of_a_diagnosis(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_library_of_effects_is_part_of_a_diagnosis(monkeypatch: pytest.MonkeyPatch) -> None:
     before = _gap(), _fit()
     monkeypatch.setattr(identities, "library_sha256", lambda: B)
     after = _gap(), _fit()

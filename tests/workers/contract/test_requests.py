@@ -18,6 +18,7 @@ def test_every_row_names_a_task_and_a_resolver_that_exist() -> None:
     for name, kind in KINDS.items():
         assert callable(kind.load_task()) and callable(load(kind.resolver)), name
         assert (kind.load_assistant() is None) == (kind.assistant is None), name
+        assert kind.origin is None or kind_of_origin(kind.origin) is kind, "a rerun finds the kind"
 
 
 def test_every_kind_but_bulk_can_be_requested() -> None:
@@ -29,24 +30,6 @@ def test_every_kind_but_bulk_can_be_requested() -> None:
     for name, model in REQUESTS.items():
         assert KINDS[name].parameters is model.model_fields["parameters"].annotation
         assert KINDS[name].resolved is not None
-
-
-def test_a_schema_names_each_request_by_its_kind() -> None:
-    schema = TypeAdapter(JobRequest).json_schema()
-    assert schema["discriminator"]["mapping"]["psf-build"] == "#/$defs/PsfBuildRequest"
-    assert set(schema["discriminator"]["mapping"]) == set(REQUESTS)
-
-
-def test_a_rerun_finds_the_kind_that_made_a_thing() -> None:
-    origins = {kind.origin: kind.name for kind in KINDS.values() if kind.origin is not None}
-    assert origins == {
-        "deconvolved": "deconvolve",
-        "built": "psf-build",
-        "fitted": "psf-fit",
-        "corrected": "gap-diagnose",
-        "interpolated": "psf-interpolate",
-    }
-    assert all(kind_of_origin(origin).name == name for origin, name in origins.items())
 
 
 A = "a" * 64
@@ -103,9 +86,6 @@ def test_shapes_are_compared_only_where_the_transit_is_fitted() -> None:
     assert not Report.model_validate({"transit_id": A, "psf_id": A}).shapes
     with pytest.raises(ValidationError, match="leave out psf_id"):
         Report.model_validate({"transit_id": A, "psf_id": A, "shapes": True})
-
-
-A = "a" * 64
 
 
 def messages(model: Any, body: object) -> str:

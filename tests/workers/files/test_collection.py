@@ -1,50 +1,42 @@
-"""Removal of files to which no row refers: recent files stay, and no other file is removed."""
+"""Removal of files that no row names, and of rows that are older than the operator keeps them; nothing else goes."""
 
 from __future__ import annotations
 
 import os
 import time
+import uuid
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 from click.testing import CliRunner
+from pydantic import ValidationError
 from sqlalchemy import text
 
 from psfcore.errors import DataError
 from service.cli.main import main
 from tests.in_process import InProcess
-from tests.s3 import client_of, digests, elsewhere, kept, key_of, opened_store, root_of
-from tests.workers.databases import change
+from tests.s3 import client_of, digests, elsewhere, kept, key_of, root_of
+from tests.workers.databases import BOTH, add, change
+from tests.workers.jobs import bulk_row
 from tests.workers.psf_examples import psf
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.tables import ImageRow, PsfRow, ReportRow, SolutionRow
+from workers.catalogue.tables import ImageRow, JobRow, PsfRow, ReportRow, SolutionRow
+from workers.contract.bulk import BulkPhase
+from workers.contract.jobs import Phase
 from workers.files import collection
+from workers.files.collection import DAY_S, retain
 from workers.files.store import Store
 from workers.settings import Settings
 
-DAY_S = 86_400.0
 collect = partial(collection.collect, second_look_after_s=0.0)
 
 
 class Killed(BaseException):
     """The end of a process; no handler of errors sees it."""
-
-
-@pytest.fixture(params=["folder", "s3"])
-def store(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Store]:
-    with opened_store(request.param, tmp_path, monkeypatch) as opened:
-        yield opened
-
-
-@pytest.fixture
-def remote(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Store]:
-    with opened_store("s3", tmp_path, monkeypatch) as opened:
-        yield opened
 
 
 in_a_folder = pytest.mark.parametrize("store", ["folder"], indirect=True)
@@ -117,9 +109,7 @@ def test_a_database_that_refers_to_few_files_needs_even_most(store: Store, catal
 
 
 @in_a_folder
-def test_old_solutions_go_with_their_files_and_do_not_count_as_lost(
-    store: Store, catalogue: Catalogue
-) -> None:
+def test_old_solutions_go_with_their_files(store: Store, catalogue: Catalogue) -> None:
     named, old, shared, third = (kept(store, content) for content in (b"a", b"bb", b"ccc", b"dddd"))
     catalogue.add(image(named))
     for digest, owner in ((old, "o"), (shared, "p"), (third, "r")):
@@ -166,15 +156,20 @@ def test_a_file_is_there_for_the_row_that_comes_after_another_owner_deleted_it(
     assert digests(store) == {other} and store.aside() == set()
 
 
-def pairs_lost(catalogue: Catalogue, store: Store, pairs: int) -> int:
-    """Delete and upload the same bytes at the same moment, as two owners; the number of rows without a file."""
-    lost = 0
+@pytest.mark.parametrize(
+    ("store", "catalogue", "pairs"),
+    [("folder", "sqlite", 25), ("folder", "postgresql", 25), ("s3", "sqlite", 10)],
+    indirect=["store", "catalogue"],
+)
+def test_no_upload_loses_its_file_to_a_deletion(store: Store, catalogue: Catalogue, pairs: int) -> None:
+    """Two owners delete and upload the same bytes."""
     with ThreadPoolExecutor(2) as threads:
         for number in range(pairs):
-            digest = kept(store, b"%d" % number)
+            content = b"%d" % number
+            digest = kept(store, content)
             catalogue.add(draft(digest, "a"))
 
-            def upload(content: bytes = b"%d" % number, digest: str = digest) -> None:
+            def upload(content: bytes = content, digest: str = digest) -> None:
                 with store.temporary() as path:
                     path.write_bytes(content)
                     with store.kept_if(path, digest):
@@ -183,33 +178,11 @@ def pairs_lost(catalogue: Catalogue, store: Store, pairs: int) -> int:
             together = [threads.submit(upload), threads.submit(delete, catalogue, store, draft(digest, "a"))]
             for one in together:
                 one.result()
-            lost += store.size(digest) is None
+            assert store.size(digest) is not None, number
             delete(catalogue, store, draft(digest, "b"))
-    return lost
 
 
-@pytest.mark.parametrize(
-    ("store", "catalogue", "pairs"),
-    [
-        ("folder", "sqlite", 25),
-        ("folder", "postgresql", 25),
-        ("s3", "sqlite", 10),
-        *(
-            pytest.param(store, catalogue, 1000, marks=pytest.mark.slow)
-            for store, catalogue in product(("folder", "s3"), ("sqlite", "postgresql"))
-        ),
-    ],
-    indirect=["store", "catalogue"],
-)
-def test_no_upload_loses_its_file_to_a_deletion_at_the_same_moment(
-    store: Store, catalogue: Catalogue, pairs: int
-) -> None:
-    assert pairs_lost(catalogue, store, pairs) == 0
-
-
-def test_a_row_that_is_deleted_while_it_is_added_again_is_added(
-    catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_row_deleted_while_it_is_added(catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
     row = draft("3" * 64, "a")
     catalogue.add(row)
     real, asked = catalogue.get, []
@@ -278,38 +251,6 @@ def test_a_file_that_is_sent_at_the_moment_of_its_removal_is_not_lost(
     )
 
 
-def test_the_next_collection_settles_files_that_a_killed_one_left_aside_and_a_dry_run_does_not(
-    remote: Store, catalogue: Catalogue, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    catalogue.add(image(kept(remote, b"a")))
-    sent, orphan = kept(remote, b"sent long ago"), kept(remote, b"orphan")
-
-    def killed(_catalogue: object, _store: object, digests: set[str]) -> set[str]:
-        if digests:
-            raise Killed
-        return set()
-
-    with monkeypatch.context() as patched, pytest.raises(Killed):
-        patched.setattr(collection, "settle", killed)
-        collect(catalogue, remote, -60.0, even_most=True)
-    catalogue.add(image(sent))
-    monkeypatch.setattr(collection, "SETTLED_AFTER_S", -60.0)
-    assert names(remote, "aside") == {sent, orphan} and len(digests(remote)) == 1
-    another, there = kept(remote, b"another"), []
-    before = objects(remote)
-    with monkeypatch.context() as patched:
-        for name in ("cp_file", "rm_file", "pipe_file", "put_file"):
-            patched.setattr(client_of(remote), name, None)
-        removed = collect(catalogue, remote, -60.0, dry_run=True).removed
-    assert [blob.digest for blob in removed] == [another]
-    assert objects(remote) == before and len(before) == 4
-    before_removal(remote, monkeypatch, another, lambda: there.append(sent in names(remote, "blobs")))
-    assert [blob.digest for blob in collect(catalogue, remote, -60.0).removed] == [another]
-    assert there == [True], "it comes back before anything else goes"
-    assert elsewhere(remote, tmp_path).path(sent).read_bytes() == b"sent long ago"
-    assert len(names(remote, "blobs")) == 2 and names(remote, "aside") == set()
-
-
 def test_a_collection_killed_anywhere_loses_nothing(
     remote: Store, catalogue: Catalogue, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -339,7 +280,12 @@ def test_a_collection_killed_anywhere_loses_nothing(
                 collect(catalogue, remote, -60.0, even_most=True)
                 killed = False
             except Killed:
-                killed = True
+                killed, before = True, objects(remote)
+                with monkeypatch.context() as reading:
+                    for name in ("cp_file", "rm_file", "pipe_file", "put_file"):
+                        reading.setattr(client_of(remote), name, None)
+                    collect(catalogue, remote, -60.0, dry_run=True)
+                assert objects(remote) == before, "a dry run settles nothing"
                 collect(catalogue, remote, -60.0, even_most=True)
         assert client_of(remote).cat_file(key_of(remote, sent)) == content, steps
         assert names(remote, "aside") == set() and orphan not in names(remote, "blobs"), steps
@@ -360,18 +306,14 @@ def test_files_aside_stay_if_the_database_seems_wrong(remote: Store, catalogue: 
 
 
 def test_a_collection_beside_a_running_service_loses_no_file(
-    settings: Settings, tmp_path: Path, image_file: Path, psf_file: Path
+    local: InProcess, tmp_path: Path, image_file: Path, psf_file: Path
 ) -> None:
-    local = InProcess(settings)
     psf = local.upload_psf(psf_file)
     product = local.deconvolve(image_file, psf_id=psf["id"], steps=1, changes=tmp_path / "e.png")
     local.wait(local.submit("psf-tables", psf_id=psf["id"]))  # tables and a picture
-    store, catalogue = Store(settings.data_dir), Catalogue(settings.catalogue_url)
-    before = {blob.digest for blob in store.blobs()}
-    assert len(before) >= 5 and collect(catalogue, store, -60.0).removed == ()
+    assert len(digests(local.store)) >= 5 and collect(local.catalogue, local.store, -60.0).removed == ()
     for part in ("file", "preview", "changes"):
         local.download(product[part], tmp_path / part)
-    local.close(), catalogue.close()
 
 
 def test_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -399,3 +341,67 @@ def test_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     change(catalogue, text("UPDATE alembic_version SET version_num = '9999'"))
     assert "not at the revision of this version" in output(status=1)
     catalogue.close()
+
+
+# Rows that are too old ------------------------------------------------------------------------------
+
+
+OLD, NEW = time.time() - 40 * DAY_S, time.time() - 2 * DAY_S
+
+
+def keeping(rules: str, *, dry_run: bool = False) -> Settings:
+    return Settings(keep_days=rules, keep_dry_run=dry_run)
+
+
+def report(catalogue: Catalogue, digest: str, owner: str, made_at: float) -> str:
+    row = ReportRow(
+        owner=owner, id=uuid.uuid4().hex * 2, created_at=made_at, kind="k", file_sha256=digest, bytes=7, details={}
+    )  # fmt: skip
+    return catalogue.add(row)[0].id
+
+
+@BOTH
+def test_the_rule_of_an_owner_replaces_the_general_one(catalogue: Catalogue, tmp_path: Path) -> None:
+    store = Store(tmp_path / "store")
+    files = {name: kept(store, name.encode()) for name in ("old", "new", "bob", "shared")}
+    report(catalogue, files["old"], "ann", OLD)
+    report(catalogue, files["shared"], "ann", OLD)
+    for name in ("new", "shared"):
+        report(catalogue, files[name], "ann", NEW)
+    report(catalogue, files["bob"], "bob", OLD)
+    rules = "report=30, bob/report=90"
+    expected = {("ann", "report"): [7, 7]}
+    assert retain(catalogue, store, keeping(rules, dry_run=True)) == expected
+    assert digests(store) == set(files.values())
+    assert retain(catalogue, store, keeping(rules)) == expected
+    assert digests(store) == set(files.values()) - {files["old"]}, "another report has the shared file"
+    assert retain(catalogue, store, keeping(rules)) == {}
+    assert retain(catalogue, store, keeping("bob/report=30")) == {("bob", "report"): [7]}
+
+
+def test_uploads_in_use_stay_and_jobs_and_runs_go_by_their_end(catalogue: Catalogue, tmp_path: Path) -> None:
+    store = Store(tmp_path / "store")
+    ids = [kept(store, name) for name in (b"free", b"of a job", b"of a run")]
+    for identity in ids:
+        catalogue.add(ImageRow(owner="ann", id=identity, created_at=OLD, bytes=1, summary={}))
+
+    def job(phase: Phase, ended_at: float | None, **parameters: str) -> JobRow:
+        key = uuid.uuid4().hex
+        return JobRow(
+            id=key, owner="ann", kind="deconvolve", parameters=parameters, request_key=key, work_key=key,
+            phase=phase, created_at=OLD, ended_at=ended_at,
+        )  # fmt: skip
+
+    add(catalogue, job(Phase.QUEUED, None, image_id=ids[1]), job(Phase.ERROR, OLD), job(Phase.COMPLETED, NEW))
+    catalogue.bulks.create(bulk_row("ann", created_at=OLD), [ids[2]])
+    add(catalogue, bulk_row("ann", "ended", phase=BulkPhase.COMPLETED, created_at=OLD, ended_at=OLD))
+    deleted = retain(catalogue, store, keeping("image=30,job=30,bulk=30"))
+    assert {kind: len(sizes) for (_, kind), sizes in deleted.items()} == {"image": 1, "job": 1, "bulk": 1}
+    assert digests(store) == set(ids[1:])
+
+
+def test_rules_are_checked() -> None:
+    for rules in ("psf=30", "image", "image=0", "image=-1", "image=ten", "ann/=3"):
+        with pytest.raises(ValidationError):
+            keeping(rules)
+    assert keeping("").kept_days == {}

@@ -1,9 +1,9 @@
-"""A request is refused for what the headers of its image and its PSF say; a deprecated PSF is not chosen, and named in warnings."""
+"""A request is refused for the ids in it and for what the headers of its image and its PSF say; deprecated PSFs."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,19 +16,19 @@ from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.header import read_summary
 from tests.conftest import write_image, write_psf
 from tests.in_process import InProcess
-from tests.workers.psf_examples import OWNER, identity, psf
+from tests.workers.psf_examples import OWNER, certify, deprecate, identity, psf, refused
 from workers.bulk.image import statistics_of
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.contexts import Pin
 from workers.catalogue.psfs import StatusAsked
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, TransitRow
 from workers.contract.identities import psf_identity
-from workers.contract.kinds import JobRequest
-from workers.contract.requests import PsfBuild, PsfFit, ResolvedDeconvolve, RichardsonLucy
+from workers.contract.kinds import JobRequest, Kind, Result
+from workers.contract.requests import Parameters, PsfBuild, PsfFit, ResolvedDeconvolve, RichardsonLucy
 from workers.intake import requests
 from workers.intake.compatibility import check, details_now, suits
+from workers.intake.requests import Asked, resolve_by_ids
 from workers.intake.uploads import image_row, uploaded_psf_row
-from workers.settings import Settings
 from workers.versions import PsfStatus
 
 AIA = {"TELESCOP": "SDO/AIA", "INSTRUME": "AIA_3", "WAVELNTH": 171, "CDELT1": 0.6, "CDELT2": 0.6}
@@ -68,37 +68,43 @@ def refusal(wanted: ResolvedDeconvolve, psf: PsfRow | None, header: dict[str, An
     return caught.value
 
 
-def test_another_channel_is_refused_unless_the_request_allows_it(tmp_path: Path) -> None:
+COARSE = {"CDELT1": 2.4, "CDELT2": 2.4}
+IN_OTHER_UNITS = {
+    "WAVELNTH": 17.1, "WAVEUNIT": "nm", "CDELT1": 0.01, "CDELT2": 0.01, "CUNIT1": "arcmin", "CUNIT2": "arcmin",
+}  # fmt: skip
+# What the cards of an image and of a PSF say besides AIA, and the error of their deconvolution.
+PAIRS: tuple[tuple[dict[str, Any], dict[str, Any], str], ...] = (
+    ({}, {}, ""),
+    (IN_OTHER_UNITS, {}, ""),
+    ({"WAVELNTH": 193}, {}, "channel-mismatch"),
+    ({"FILTER": "thin"}, {"FILTER": "thick"}, "channel-mismatch"),
+    (COARSE, {"PSFNAME": "aia"}, "plate-scale-mismatch"),
+)
+
+
+def test_a_psf_suits_an_image_if_its_deconvolution_is_not_refused(tmp_path: Path) -> None:
+    for of_image, of_psf, code in PAIRS:
+        header, psf = summary_of(tmp_path, **(AIA | of_image)), psf_of(tmp_path, **(AIA | of_psf))
+        assert suits(psf, header) is (code == ""), (of_image, of_psf)
+        if code:
+            assert refusal(request(), psf, header).code == code
+        else:
+            check(request(), psf, header)
+    header = summary_of(tmp_path, **AIA)
+    assert suits("aia_171", header) and not suits("aia_193", header)
+
+
+def test_the_differences_of_the_channels_are_told_and_may_be_allowed(tmp_path: Path) -> None:
     header, psf = summary_of(tmp_path, **{**AIA, "WAVELNTH": 193}), psf_of(tmp_path, **AIA)
-    error = refusal(request(), psf, header)
-    assert error.code == "channel-mismatch"
-    assert error.fields["differences"] == [
+    assert refusal(request(), psf, header).fields["differences"] == [
         "the image is of aia_193, the PSF of aia_171",
         "the image is of 193 angstrom, the PSF of 171 angstrom",
     ]
     check(request(other_channel=True), psf, header)
     named = psf_of(tmp_path, instrument="aia_171", channel="171")
     assert refusal(request(), named, header).code == "channel-mismatch", "that an upload was given"
-
-
-def test_a_psf_suits_an_image_if_its_deconvolution_is_not_refused(tmp_path: Path) -> None:
-    header = summary_of(tmp_path, **AIA)
-    for candidate, fits_it in (
-        (psf_of(tmp_path, **AIA), True),
-        (psf_of(tmp_path, **{**AIA, "WAVELNTH": 193}), False),
-        (psf_of(tmp_path, **{**AIA, "CDELT1": 0.25, "CDELT2": 0.25}), False),
-        ("aia_171", True),
-        ("aia_193", False),
-    ):
-        assert suits(candidate, header) is fits_it
-
-
-def test_another_filter_is_refused_and_the_units_of_the_cards_count(tmp_path: Path) -> None:
-    header, psf = summary_of(tmp_path, **AIA, FILTER="thin"), psf_of(tmp_path, **AIA, FILTER="thick")
-    assert "FILTER" in refusal(request(), psf, header).message
-    in_nm = {**AIA, "WAVELNTH": 17.1, "WAVEUNIT": "nm"}
-    in_arcmin = {"CDELT1": 0.01, "CDELT2": 0.01, "CUNIT1": "arcmin", "CUNIT2": "arcmin"}
-    check(request(), psf_of(tmp_path, **AIA), summary_of(tmp_path, **(in_nm | in_arcmin)))
+    whole = dataclasses.asdict(read_summary(tmp_path / "i.fits", LIMITS))
+    assert refusal(request(), psf, whole).code == "channel-mismatch", "of a file that was not uploaded"
 
 
 def test_a_psf_that_is_not_built_yet_is_compared_by_its_instrument_file(tmp_path: Path) -> None:
@@ -110,22 +116,13 @@ def test_a_psf_that_is_not_built_yet_is_compared_by_its_instrument_file(tmp_path
 def test_pixels_of_another_size_are_refused_with_the_factor_that_helps(tmp_path: Path) -> None:
     # The PSF names its instrument, and the image does not, so a whole multiple may be a coincidence.
     psf = psf_of(tmp_path, **AIA, PSFNAME="aia")
-    header = summary_of(tmp_path, **{**AIA, "CDELT1": 2.4, "CDELT2": 2.4})
-    error = refusal(request(other_channel=True), psf, header)
-    assert (error.code, error.fields["factor"]) == ("plate-scale-mismatch", 4)
-    assert "heliopsf psf rebin PSF --factor 4" in error.message
     matrix = {"CD1_1": 1.92, "CD1_2": -1.44, "CD2_1": 1.44, "CD2_2": 1.92}
     named = {key: AIA[key] for key in ("TELESCOP", "INSTRUME", "WAVELNTH")}
-    error = refusal(request(other_channel=True), psf, summary_of(tmp_path, **named, **matrix))
-    assert (error.code, error.fields["factor"]) == ("plate-scale-mismatch", 4)
-    odd = {**header, "cards": {**header["cards"], "CDELT1": 1.5, "CDELT2": 1.5}}
-    assert refusal(request(other_channel=True), psf, odd).fields["factor"] is None
-
-
-def test_the_summary_of_a_file_that_was_not_uploaded_is_checked_too(tmp_path: Path) -> None:
-    write_image(tmp_path / "i.fits", **{**AIA, "WAVELNTH": 193})
-    header = dataclasses.asdict(read_summary(tmp_path / "i.fits", LIMITS))
-    assert refusal(request(), psf_of(tmp_path, **AIA), header).code == "channel-mismatch"
+    odd = {"CDELT1": 1.5, "CDELT2": 1.5}
+    for scale, factor in ((COARSE, 4), (matrix, 4), (odd, None)):
+        error = refusal(request(other_channel=True), psf, summary_of(tmp_path, **(named | scale)))
+        assert (error.code, error.fields["factor"]) == ("plate-scale-mismatch", factor), scale
+        assert ("heliopsf psf rebin PSF --factor 4" in error.message) is (factor == 4)
 
 
 def change(catalogue: Catalogue, status: PsfStatus, reason: str = "", **more: Any) -> None:
@@ -133,46 +130,33 @@ def change(catalogue: Catalogue, status: PsfStatus, reason: str = "", **more: An
 
 
 @pytest.fixture
-def catalogue(local: InProcess, settings: Settings, psf_file: Path, tmp_path: Path) -> Iterator[Catalogue]:
-    """The catalogue holds the PSF that is built for HRI_EUV, with other pixels, as a certified PSF."""
+def catalogue(local: InProcess, psf_file: Path, tmp_path: Path) -> Catalogue:
+    """The catalogue of the local service holds the PSF that is built for HRI_EUV, with other pixels, as a certified PSF."""
     write_image(tmp_path / "i.fits", **HRI, **AT)
-    found = Catalogue(settings.catalogue_url)
+    found = local.catalogue
     uploaded = found.get(PsfRow, local.upload_psf(psf_file)["id"], OWNER)
     assert uploaded is not None
     row = psf("built", file_sha256=uploaded.file_sha256, bytes=uploaded.bytes, details=uploaded.details)
     row.id = BUILT
     found.add(row)
     change(found, PsfStatus.CERTIFIED, version="1.0.0")
-    yield found
-    found.close()
+    return found
 
 
-def test_the_service_does_not_choose_a_psf_that_was_deprecated(
-    local: InProcess, catalogue: Catalogue, tmp_path: Path
-) -> None:
-    assert local.deconvolve(tmp_path / "i.fits", **FEW)["psf_id"] == BUILT
+def test_a_deprecated_psf_is_not_chosen(local: InProcess, catalogue: Catalogue, tmp_path: Path) -> None:
+    deconvolve = partial(local.deconvolve, tmp_path / "i.fits", **FEW)
+    assert deconvolve()["psf_id"] == BUILT
     change(catalogue, PsfStatus.DEPRECATED, "wrong mesh")
-    with pytest.raises(DataError) as caught:
-        local.deconvolve(tmp_path / "i.fits", **FEW)
-    assert caught.value.code == "psf-deprecated"
-    for told in ("builds for hri_euv was deprecated", "reason: wrong mesh", f"--psf {BUILT[:12]}"):
-        assert told in caught.value.message
-
-
-def test_the_error_names_the_successor(local: InProcess, catalogue: Catalogue, tmp_path: Path) -> None:
+    message = refused("psf-deprecated", deconvolve)
+    assert "hri_euv" in message and "reason: wrong mesh" in message and f"--psf {BUILT[:12]}" in message
     catalogue.add(psf("better"))
-    asked = StatusAsked(PsfStatus.CERTIFIED, "", version="2.0.0", supersedes=(BUILT,))
-    catalogue.psfs.change(identity("better"), OWNER, asked, "tester")
-    changed = StatusAsked(PsfStatus.DEPRECATED, "also wrong")
-    catalogue.psfs.change(identity("better"), OWNER, changed, "tester")
-    with pytest.raises(DataError) as caught:
-        local.deconvolve(tmp_path / "i.fits", **FEW)
-    assert f"no reason was given) (its successor is {identity('better')[:12]})" in caught.value.message
+    certify(catalogue, "better", "2.0.0")
+    change(catalogue, PsfStatus.DEPRECATED, successor_id=identity("better"))
+    deprecate(catalogue, "better")
+    assert f"its successor is {identity('better')[:12]}" in refused("psf-deprecated", deconvolve)
 
 
-def test_a_named_deprecated_psf_is_used_with_a_warning_also_for_a_product_made_before(
-    local: InProcess, catalogue: Catalogue, tmp_path: Path
-) -> None:
+def test_a_named_deprecated_psf_is_warned_of(local: InProcess, catalogue: Catalogue, tmp_path: Path) -> None:
     before = local.deconvolve(tmp_path / "i.fits", psf_id=BUILT, **FEW)
     assert "psf-deprecated" not in str(before["details"]["warnings"])
     change(catalogue, PsfStatus.DEPRECATED, "wrong mesh")
@@ -189,9 +173,7 @@ def test_a_named_deprecated_psf_is_used_with_a_warning_also_for_a_product_made_b
     assert "WARNING (psf-deprecated)" in history
 
 
-def test_a_context_of_an_earlier_moment_still_chooses_it(
-    local: InProcess, catalogue: Catalogue, tmp_path: Path
-) -> None:
+def test_an_earlier_context_still_chooses_it(local: InProcess, catalogue: Catalogue, tmp_path: Path) -> None:
     catalogue.contexts.create("old", OWNER, "tester", pins=[Pin(BUILT)])
     change(catalogue, PsfStatus.DEPRECATED)
     product = local.deconvolve(tmp_path / "i.fits", context="old", **FEW)
@@ -215,6 +197,33 @@ def test_a_fit_does_not_choose_a_diffraction_psf_that_was_deprecated(catalogue: 
     assert requests.resolve(asked, catalogue, OWNER)[0]["diffraction_recipe"] is not None
     for status, version in ((PsfStatus.CERTIFIED, "1.0.0"), (PsfStatus.DEPRECATED, None)):
         catalogue.psfs.change(row.id, OWNER, StatusAsked(status, "blurred", version=version), "tester")
-    with pytest.raises(DataError) as caught:
-        requests.resolve(asked, catalogue, OWNER)
-    assert caught.value.code == "psf-deprecated" and "known_psf" in caught.value.message
+    assert "known_psf" in refused("psf-deprecated", lambda: requests.resolve(asked, catalogue, OWNER))
+
+
+# Ids in the parameters of any kind ------------------------------------------------------------------
+
+
+UNKNOWN = "f" * 64
+
+
+class Two(Parameters):
+    """Parameters with two PSFs, and ids that may be missing."""
+
+    psf_id: str
+    other_psf_id: str | None = None
+    reference_transit_id: str | None = None
+    no_id: str = UNKNOWN
+
+
+def resolved(catalogue: Catalogue, **parameters: str) -> Parameters:
+    kind = Kind("two", task="", result=Result.REPORT, parameters=Two, resolved=Two)
+    return resolve_by_ids(Asked(kind, Two(**parameters), catalogue, OWNER, ()))
+
+
+def test_every_id_is_checked(catalogue: Catalogue) -> None:
+    known = catalogue.add(psf("one"))[0].id
+    assert resolved(catalogue, psf_id=known, other_psf_id=known) == Two(psf_id=known, other_psf_id=known)
+    for name, code in (("other_psf_id", "no-such-psf"), ("reference_transit_id", "no-such-transit")):
+        with pytest.raises(DataError, match=UNKNOWN) as caught:
+            resolved(catalogue, **({"psf_id": known} | {name: UNKNOWN}))
+        assert caught.value.code == code

@@ -4,6 +4,7 @@ and for programs, if its PSF is not known."""
 from __future__ import annotations
 
 import pickle
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -60,9 +61,7 @@ def test_only_a_series_that_says_so_is_interpolated(certified: Catalogue) -> Non
     assert [(one.interpolated, one.by) for one in changes] == [(False, "tester"), (True, "tester")]
 
 
-def test_within_a_range_the_certified_psf_is_used_and_beyond_the_ends_nothing_is_extrapolated(
-    certified: Catalogue,
-) -> None:
+def test_nothing_is_interpolated_within_a_range_or_beyond_the_ends(certified: Catalogue) -> None:
     allow(certified)
     inside = picked_for_image(certified, header_of("2022-06-01"), OWNER, None)
     assert inside is not None and inside.one().name == "b" and inside.interpolation is None
@@ -179,13 +178,6 @@ def test_unknown_series_and_other_kinds_are_refused(certified: Catalogue) -> Non
     assert certified.series.all("somebody") == {}
 
 
-def test_changes_of_a_series_count_in_the_quota(certified: Catalogue) -> None:
-    before = certified.owners.usage(OWNER, 0).used_rows
-    allow(certified)
-    allow(certified)
-    assert certified.owners.usage(OWNER, 0).used_rows == before + 1, "the second changes nothing"
-
-
 WRONG = (
     ({"time": "2020-12-31"}, "not extrapolated"),
     ({"time": "2022-01-01T00:00:01"}, "not extrapolated"),
@@ -240,9 +232,7 @@ def test_the_header_chooses_the_variant(variants: Catalogue) -> None:
     assert chosen(variants, image("closed")) == "plain"
     assert chosen(variants, image("Open 2")) == "open_2"
     assert chosen(variants, image(None, 0.984)) == "binned"
-    with pytest.raises(DataError) as caught:
-        chosen(variants, image("Open 2", 0.984))
-    assert caught.value.code == "several-variants-fit"
+    refused("several-variants-fit", lambda: chosen(variants, image("Open 2", 0.984)))
     assert picked_for_image(variants, image("Open 2"), "somebody", None) is None
     assert chosen(variants, image("Open 2", wavelnth=174.5)) == "open_2"
 
@@ -251,9 +241,8 @@ def test_a_variant_has_its_own_versions_ranges_and_interpolation(variants: Catal
     row = variants.psfs.released("hri_euv/174-open_2/total", OWNER)
     assert list(row) == ["1.0.0"]
     late = image("Open 2", date="2023-06-01")
-    with pytest.raises(DataError, match="channel 174-open_2") as caught:
-        chosen(variants, late)
-    assert caught.value.code == "no-psf-fits", "the PSF of the channel alone is not used in its place"
+    # The PSF of the channel alone is not used in its place.
+    assert "channel 174-open_2" in refused("no-psf-fits", lambda: chosen(variants, late))
     variants.add(psf("later"))
     certify(variants, "later", "2.0.0", years(2024, None), channel="174-open_2")
     variants.series.set_interpolated("hri_euv/174-open_2/total", OWNER, True, "x")
@@ -275,12 +264,11 @@ def test_a_context_chooses_among_its_own_variants(variants: Catalogue) -> None:
 def test_only_a_draft_becomes_a_variant_of_its_channel(variants: Catalogue) -> None:
     variants.add(psf("other"))
     for channel in ("304", "304-open_2", "1740"):
-        with pytest.raises(DataError) as caught:
-            certify(variants, "other", "9.0.0", channel=channel)
-        assert caught.value.code == "line-known"
-    with pytest.raises(DataError) as caught:
-        certify(variants, "plain", "1.0.0", years(2020, 2021), channel="174-open_1")
-    assert caught.value.code == "line-known", "a variants PSF keeps its series"
+        refused("line-known", partial(certify, variants, "other", "9.0.0", channel=channel))
+    # A certified PSF keeps its series.
+    refused(
+        "line-known", lambda: certify(variants, "plain", "1.0.0", years(2020, 2021), channel="174-open_1")
+    )
 
 
 # TELESCOP differs from that of the archive, so the image is not recognised as one of aia_171.
@@ -319,51 +307,27 @@ def test_the_error_names_instruments_psfs_and_ways(local: InProcess, tmp_path: P
     for named in (of_telescope, "aia_171", "SDO AIA_3", "171 angstrom"):
         assert named in error.message
     assert "hri_euv" not in error.message
+    assert [one["name"] for one in error.fields["instruments"]][:4] == [
+        "aia_171",
+        "aia_94",
+        "aia_131",
+        "aia_193",
+    ]
+    again = pickle.loads(pickle.dumps(error))
+    assert (again.code, again.message, again.fields) == (error.code, error.message, error.fields)
 
 
 def test_what_does_not_agree_is_told_too(local: InProcess, tmp_path: Path) -> None:
     upload(local, tmp_path / "aia.fits", 32, INSTRUME="AIA_3", CDELT1=0.6)
     error = refused_image(local, tmp_path, **{**AIA, "WAVELNTH": 1600, "CDELT1": 2.4, "CDELT2": 2.4})
-    instruments = {one["name"]: one["told"] for one in error.fields["instruments"]}
-    other_scale = "another pixel scale (0.599489, not 2.4 arcsec)"
-    assert instruments["aia_171"] == (
-        f"same telescope, but another channel (171, not 1600 Å) and {other_scale}"
-    )
-    assert [psf["told"] for psf in error.fields["psfs"]] == [
-        "same telescope, but another pixel scale (0.6, not 2.4 arcsec)"
-    ]
-    error = refused_image(local, tmp_path / "again", **{**AIA, "WAVELNTH": 1600})
-    instruments = {one["name"]: one["told"] for one in error.fields["instruments"]}
-    assert instruments["aia_171"] == "same telescope and pixel scale, but another channel (171, not 1600 Å)"
-    assert error.fields["image"] == "SDO AIA_3"
+    (of_file,) = (one["told"] for one in error.fields["instruments"] if one["name"] == "aia_171")
+    for told in ("same telescope, but", "171, not 1600 Å", "another pixel scale", "not 2.4 arcsec"):
+        assert told in of_file
+    (of_psf,) = (psf["told"] for psf in error.fields["psfs"])
+    assert of_psf == "same telescope, but another pixel scale (0.6, not 2.4 arcsec)"
 
 
 def test_an_image_without_any_name_gets_the_ways_too(local: InProcess, tmp_path: Path) -> None:
     error = refused_image(local, tmp_path, TELESCOP="")
     assert error.fields["psfs"] == [] and len(error.fields["ways"]) == 3
     assert "an unnamed instrument" in error.message
-
-
-def test_instruments_that_agree_most_come_first_also_in_another_process(
-    local: InProcess, tmp_path: Path
-) -> None:
-    error = refused_image(local, tmp_path, **AIA)
-    names = [one["name"] for one in error.fields["instruments"]]
-    assert names[:4] == ["aia_171", "aia_94", "aia_131", "aia_193"]
-    again = pickle.loads(pickle.dumps(error))
-    assert (again.code, again.message, again.fields) == (error.code, error.message, error.fields)
-
-
-PUBLISHED: tuple[tuple[dict[str, object], str, str], ...] = (
-    ({"TELESCOP": "HINODE", "INSTRUME": "XRT"}, "upload", "SolarSoft"),
-    ({"TELESCOP": "TRACE", "INSTRUME": "TRACE", "WAVE_LEN": "1600"}, "fit", "Venus of 2004"),
-    ({"TELESCOP": "SOHO", "INSTRUME": "EIT", "WAVELNTH": 195}, "upload", "eit_degrid"),
-    ({"TELESCOP": "PROBA2", "INSTRUME": "SWAP", "WAVELNTH": 174}, "fit", "covers a part of the Sun"),
-)
-
-
-def test_the_ways_name_what_is_published_for_the_telescope(local: InProcess, tmp_path: Path) -> None:
-    for number, (cards, way, published) in enumerate(PUBLISHED):
-        error = refused_image(local, tmp_path / str(number), **cards)
-        texts = {one["way"]: one["text"] for one in error.fields["ways"]}
-        assert [name for name, text in texts.items() if published in text] == [way]

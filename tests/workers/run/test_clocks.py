@@ -126,9 +126,7 @@ def test_the_database_s_clock_goes_on_within_a_transaction_of_many_statements(ca
     assert 0.03 < second - first < 10.0 and abs(second - TRUE_TIME()) < 5.0
 
 
-def test_a_lost_job_part_and_worker_are_not_kept_until_a_clock_that_was_set_back_has_caught_up(
-    catalogue: Catalogue,
-) -> None:
+def test_what_is_lost_is_given_up_after_the_clock_was_set_back(catalogue: Catalogue) -> None:
     job_id, _ = started(catalogue)
     catalogue.parts.open("o", "k", 1)
     assert catalogue.parts.take("o", "k", LEASE_S) is not None
@@ -144,9 +142,7 @@ def test_a_lost_job_part_and_worker_are_not_kept_until_a_clock_that_was_set_back
     assert catalogue.parts.take("o", "k", LEASE_S) is not None
 
 
-def test_a_running_job_survives_a_clock_that_is_set_back_and_a_lost_message_is_repeated(
-    catalogue: Catalogue,
-) -> None:
+def test_a_running_job_survives_a_clock_that_is_set_back(catalogue: Catalogue) -> None:
     job_id, lease = started(catalogue)
     waiting, _ = catalogue.jobs.submit("psf-build", {}, "waiting", DEFAULT_OWNER)
     catalogue.jobs.mark_submitted(waiting.id)

@@ -6,7 +6,6 @@ The heartbeat of a job goes on after the database did not answer once.
 from __future__ import annotations
 
 import json
-import logging
 import shutil
 import signal
 import threading
@@ -17,54 +16,20 @@ from types import SimpleNamespace
 from typing import Any
 
 import psutil
-import pytest
 from sqlalchemy.exc import OperationalError
 
 from tests.whole.stack import wait_for
-from tests.workers.jobs import job_row
+from tests.workers.jobs import Bench, Task, job_row
 from tests.workers.run.processes import started_worker, worker_of
-from workers import logs
 from workers.broker import app as queue
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
-from workers.catalogue.tables import DEFAULT_OWNER, JobRow
+from workers.catalogue.tables import DEFAULT_OWNER
 from workers.contract.jobs import Phase
-from workers.files.store import Store
 from workers.run.attempt import Attempt
 from workers.run.child import Stopping
-from workers.run.runner import Runner
 from workers.settings import Settings
 from workers.tasks.context import Context
-
-Task = Callable[[Context, Mapping[str, Any]], str]
-
-
-class Bench:
-    """A runner with one task of the test's own, in a thread."""
-
-    def __init__(self, folder: Path, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.catalogue = catalogue
-        self.stopping = Stopping()
-        self._settings = Settings(data_dir=folder / "data", heartbeat_s=0.05, broker_url="filesystem://")
-        self._monkeypatch = monkeypatch
-
-    def run(self, task: Task) -> JobRow:
-        """The job's row after a run of it."""
-        self._monkeypatch.setattr("workers.tasks.psf_build.psf_build", task)
-        job, _ = self.catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)
-        self.catalogue.jobs.mark_submitted(job.id)
-        store = Store(self._settings.data_dir)
-        Runner(self._settings, self.catalogue, store, stopping=self.stopping).run(job.id)
-        return self.row(job.id)
-
-    def row(self, job_id: str) -> JobRow:
-        """The job's row."""
-        return job_row(self.catalogue, job_id)
-
-
-@pytest.fixture
-def bench(tmp_path: Path, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> Bench:
-    return Bench(tmp_path, catalogue, monkeypatch)
 
 
 def steps_for(seconds: float, at_work: Callable[[], None] = lambda: None) -> Task:
@@ -101,19 +66,6 @@ def test_a_job_that_ends_in_time_is_let_end_and_asking_again_does_not_move_the_m
     assert stopping.asked and stopping.due
 
 
-def test_a_task_that_does_not_listen_loses_its_job_all_the_same(bench: Bench) -> None:
-    seen: list[str] = []
-
-    def deaf(context: Context, _: Mapping[str, Any]) -> str:
-        bench.stopping.ask(0.0)
-        wait_for(lambda: bench.row(context.job_id).phase == Phase.QUEUED, "the job is handed back")
-        seen.append("handed back while it ran")
-        return "too late"
-
-    row = bench.run(deaf)
-    assert seen and (row.phase, row.result_id, row.attempt) == (Phase.QUEUED, None, 0)
-
-
 def test_a_worker_that_stops_takes_no_job(bench: Bench) -> None:
     bench.stopping.ask(30.0)
     row = bench.run(steps_for(0.0))
@@ -129,25 +81,8 @@ def test_a_cancelled_job_is_not_handed_back(bench: Bench) -> None:
         bench.stopping.ask(0.0)
         return steps_for(60.0)(context, {})
 
-    assert bench.run(cancelled).phase == Phase.ABORTED
-
-
-def test_the_lines_of_a_job_carry_its_id_and_owner(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
-    said: list[dict[str, str]] = []
-
-    class Keep(logging.Handler):
-        def emit(self, record: logging.LogRecord) -> None:
-            said.append({"message": record.getMessage(), **logs.about()})
-
-    keep = Keep()
-    logging.getLogger("workers.run").addHandler(keep)
-    caplog.set_level(logging.INFO)
-    row = bench.run(steps_for(60.0, at_work=lambda: bench.stopping.ask(0.0)))
-    logging.getLogger("workers.run").removeHandler(keep)
-    by_heart = [one for one in said if "handed back" in one["message"]]
-    assert by_heart and len(said) >= 3
-    assert all((one["job"], one["owner"]) == (row.id, "local") for one in said)
-    assert logs.about() == {}
+    row = bench.run(cancelled)
+    assert (row.phase, row.result_id) == (Phase.ABORTED, None)
 
 
 # Heartbeats -----------------------------------------------------------------------------------------
@@ -174,25 +109,14 @@ def test_a_heartbeat_that_failed_is_followed_by_another() -> None:
 
 # Real processes -------------------------------------------------------------------------------------
 
-TASKS = {
-    "listens": """
-def task(context, _):
-    while True:
-        context.report("at work", 1, 2)
-        time.sleep(0.02)
-""",
-    "deaf": """
+DEAF = worker_of("""
 def task(context, _):
     context.report("at work", 2, 2)
     time.sleep(60)
-""",
-}
+""")
 
 
-@pytest.mark.parametrize("task", [pytest.param("listens", marks=pytest.mark.slow), "deaf"])
-def test_a_worker_process_hands_its_job_back_and_is_gone_in_the_time_it_states(
-    tmp_path: Path, task: str
-) -> None:
+def test_a_worker_that_stops_hands_back_the_job_of_a_deaf_task_and_is_gone(tmp_path: Path) -> None:
     settings = Settings(data_dir=tmp_path / "data", broker_url="filesystem://", stop_s=0.5, heartbeat_s=0.2)
     settings.data_dir.mkdir()
     catalogue = Catalogue(settings.catalogue_url)
@@ -200,7 +124,7 @@ def test_a_worker_process_hands_its_job_back_and_is_gone_in_the_time_it_states(
     job, _ = catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)
     assert queue.submit(queue.make_app(settings), job.id)
     log = tmp_path / "worker.log"
-    worker = started_worker(worker_of(TASKS[task]), settings, log, stop_s=0.5, heartbeat_s=0.2, lease_s=3)
+    worker = started_worker(DEAF, settings, log, stop_s=0.5, heartbeat_s=0.2, lease_s=3)
     try:
         wait_for(lambda: job_row(catalogue, job.id).phase == "EXECUTING", "the job is at work")
         wait_for(lambda: len(catalogue.census.workers(3.0)) == 1, "the worker says that it is there")
@@ -215,13 +139,14 @@ def test_a_worker_process_hands_its_job_back_and_is_gone_in_the_time_it_states(
     assert status == 0 and left == [], f"{status}, {left}; {log.read_text()}"
     row = job_row(catalogue, job.id)
     assert (row.phase, row.attempt, row.submitted_at) == (Phase.QUEUED, 0, None)
-    told_of = log.read_text()
-    assert ("another worker has the job" in told_of) == (task == "listens"), told_of
-    assert "exiting now" in told_of or task == "listens", told_of
     assert catalogue.census.workers(60.0) == [], "it took its leave"
     catalogue.close()
     lines = [json.loads(line) for line in log.read_text().splitlines()]
-    assert any(line.get("job") == job.id for line in lines)
+    assert "exiting now" in lines[-1]["message"], lines
+    (handed_back,) = [line for line in lines if "handed back" in line["message"]]
+    assert (handed_back["job"], handed_back["owner"]) == (job.id, DEFAULT_OWNER), (
+        "the thread of the heartbeat"
+    )
 
 
 def test_a_worker_that_ends_by_an_error_has_no_status_of_success(settings: Settings, tmp_path: Path) -> None:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import logging
 import os
-import random
 import subprocess
 import sys
 import time
 from collections.abc import Mapping
-from contextlib import ExitStack
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -20,10 +18,8 @@ from sqlalchemy import select, text, update
 from sqlalchemy.exc import OperationalError
 
 from psfcore.compiled import KernelFiles, listening
-from tests.in_process import InProcess
-from tests.whole.stack import Missing, Redis, postgres_database
 from tests.workers.databases import BOTH, change, rows
-from tests.workers.jobs import claimed
+from tests.workers.jobs import Bench, claimed
 from tests.workers.run.processes import started_worker, worker_of
 from workers.broker import app as queue
 from workers.broker.reconciler import reconcile
@@ -31,15 +27,14 @@ from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.schema import Schema
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow
 from workers.contract.jobs import Phase, Queue
-from workers.files.store import Store
 from workers.run import worker
 from workers.run.attempt import COMPILING
-from workers.run.runner import Runner
 from workers.settings import Settings
 from workers.tasks.context import Context
 
 LEASE_S, IDLE_S = 3.0, 6.0
-STILL_S = 180.0  # longest time without the end of a job, on a busy machine
+JOBS = 20
+STILL_S = 180.0  # longest time of all jobs, on a busy machine
 SHORT = """
 def task(context, _):
     context.report("at work", 1, 2)
@@ -83,19 +78,7 @@ def test_a_database_that_is_away_is_waited_for(
     assert "s3cret" not in caplog.text
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        [sys.executable, "-m", "service.cli", "worker"],
-        pytest.param(
-            [sys.executable, "-m", "celery", "-A", "workers.run.worker", "worker"], marks=pytest.mark.slow
-        ),
-    ],
-    ids=["heliopsf worker", "celery"],
-)
-def test_a_worker_on_a_later_database_ends_with_a_line_and_status_1(
-    settings: Settings, command: list[str]
-) -> None:
+def test_a_worker_on_a_later_database_ends_with_a_line_and_status_1(settings: Settings) -> None:
     settings.data_dir.mkdir()
     catalogue = Catalogue(settings.catalogue_url)
     catalogue.upgrade()
@@ -103,7 +86,7 @@ def test_a_worker_on_a_later_database_ends_with_a_line_and_status_1(
     catalogue.close()
     kept = {name: value for name, value in os.environ.items() if not name.startswith("HELIOPSF_")}
     ended = subprocess.run(
-        command,
+        [sys.executable, "-m", "service.cli", "worker"],
         env=kept | {"HELIOPSF_DATA_DIR": str(settings.data_dir), "HELIOPSF_BROKER_URL": "filesystem://"},
         capture_output=True,
         text=True,
@@ -134,68 +117,48 @@ def test_only_jobs_that_a_worker_could_run_keep_it(catalogue: Catalogue) -> None
     assert jobs.complete(lease, "r") and not to_do(worker="another worker")
 
 
-@pytest.mark.parametrize(
-    ("served", "jobs", "workers", "kills"),
-    [(False, 20, 2, 1), pytest.param(True, 500, 5, 3, marks=pytest.mark.slow)],
-    ids=["folder and SQLite", "Redis and PostgreSQL"],
-)
-def test_each_job_ends_once_and_the_workers_leave(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, served: bool, jobs: int, workers: int, kills: int
+def test_each_job_ends_once_although_a_worker_is_killed_and_the_others_leave(
+    tmp_path: Path, catalogue: Catalogue, settings: Settings, caplog: pytest.LogCaptureFixture
 ) -> None:
-    with ExitStack() as resources:
-        try:
-            urls = {
-                "broker_url": resources.enter_context(Redis(tmp_path)).url if served else "filesystem://",
-                "database_url": resources.enter_context(postgres_database()) if served else None,
-            }
-        except Missing as missing:
-            pytest.skip(str(missing))
-        quick = {"lease_s": LEASE_S, "heartbeat_s": 0.5, "resubmit_s": 3.0}
-        settings = Settings(data_dir=tmp_path / "data", **quick, **urls)  # type: ignore[arg-type]
-        settings.data_dir.mkdir()
-        catalogue, app = Catalogue(settings.catalogue_url), queue.make_app(settings)
-        resources.callback(catalogue.close)
-        catalogue.upgrade()
-        for number in range(jobs):
-            catalogue.jobs.submit("psf-build", {}, f"job {number}", DEFAULT_OWNER)
-        named = {name: value for name, value in urls.items() if value and name == "database_url"}
-        started = [
-            started_worker(WORKER, settings, tmp_path / f"{number}.log", worker_threads=1, **quick, **named)
-            for number in range(workers)
-        ]
-        processes = [psutil.Process(worker.pid) for worker in started]
-        try:
-            lost, done, chance, deadline = 0, 0, random.Random(0), time.monotonic() + STILL_S
-            while any(worker.poll() is None for worker in started):
-                assert time.monotonic() < deadline, [p.read_text()[-2000:] for p in tmp_path.glob("*.log")]
-                reconcile(catalogue, app, settings)
-                before = done
-                done = len(rows(catalogue, select(JobRow.id).where(JobRow.phase == Phase.COMPLETED)))
-                if done > before:
-                    deadline = time.monotonic() + STILL_S
-                if lost < kills and done > jobs * (lost + 1) / (kills + 2):
-                    lost += 1
-                    killed = processes.pop(chance.randrange(len(processes)))
-                    for process in (killed, *killed.children(recursive=True)):
-                        process.kill()
-                time.sleep(0.2)
-            ended = rows(catalogue, select(JobRow).where(JobRow.phase == Phase.COMPLETED))
-            assert (len(ended), lost) == (jobs, kills)
-            again = caplog.text.count("no heartbeat from its worker; queued again")
-            assert sum(job.attempt for job in ended) == jobs + again, (
-                "only jobs whose worker was silent ran again"
-            )
-            assert sorted(worker.returncode for worker in started) == [-9] * kills + [0] * (workers - kills)
-        finally:
-            for worker in started:
-                if worker.poll() is None:
-                    worker.kill()
-                worker.wait()
+    quick = {"lease_s": LEASE_S, "heartbeat_s": 0.5, "resubmit_s": 3.0}
+    settings = settings.model_copy(update=quick | {"database_url": f"sqlite:///{tmp_path / 'c.sqlite'}"})
+    settings.data_dir.mkdir()
+    app = queue.make_app(settings)
+    for number in range(JOBS):
+        catalogue.jobs.submit("psf-build", {}, f"job {number}", DEFAULT_OWNER)
+    started = [
+        started_worker(
+            WORKER, settings, tmp_path / f"{number}.log", worker_threads=1, **quick,
+            database_url=str(settings.database_url),
+        )
+        for number in range(2)
+    ]  # fmt: skip
+    killed, completed = False, select(JobRow).where(JobRow.phase == Phase.COMPLETED)
+    try:
+        deadline = time.monotonic() + STILL_S
+        while any(worker.poll() is None for worker in started):
+            assert time.monotonic() < deadline, [p.read_text()[-2000:] for p in tmp_path.glob("*.log")]
+            reconcile(catalogue, app, settings)
+            if not killed and len(rows(catalogue, completed)) > JOBS / 3:
+                killed, first = True, psutil.Process(started[0].pid)
+                for process in (first, *first.children(recursive=True)):
+                    process.kill()
+            time.sleep(0.2)
+        ended = rows(catalogue, completed)
+        assert (len(ended), killed) == (JOBS, True)
+        again = caplog.text.count("no heartbeat from its worker; queued again")
+        assert sum(job.attempt for job in ended) == JOBS + again, (
+            "only a job whose worker was silent ran again"
+        )
+        assert [worker.returncode for worker in started] == [-9, 0]
+    finally:
+        for worker in started:
+            if worker.poll() is None:
+                worker.kill()
+            worker.wait()
 
 
-def test_a_job_that_compiles_says_so(
-    tmp_path: Path, settings: Settings, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_job_that_compiles_says_so(tmp_path: Path, bench: Bench) -> None:
     """A kernel is compiled after its file was looked for in vain, and before its file is written."""
     files = KernelFiles(str(tmp_path), "f.py311", "source")
     told: list[tuple[str, int, int]] = []
@@ -212,10 +175,7 @@ def test_a_job_that_compiles_says_so(
         stages.extend(sorted(context.times.spent))
         return "0" * 64
 
-    monkeypatch.setattr("workers.tasks.psf_build.psf_build", task)
-    job, _ = catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)
-    runner = Runner(settings, catalogue, Store(settings.data_dir))
-    runner.run(job.id, lambda *progress: told.append(progress))
+    bench.run(task, lambda *progress: told.append(progress))
     assert told == [("reading", 0, 20), (COMPILING, 0, 1), ("deconvolving", 1, 20), ("deconvolving", 1, 20)]
     assert stages == [COMPILING, COMPILING, "deconvolving", "reading", "starting"]
 
@@ -232,21 +192,3 @@ def test_only_the_thread_that_listens_is_told(tmp_path: Path) -> None:
         assert files.load(("float32",)) == "code" and told == [False, True]
     files.load(("float64",))
     assert told == [False, True]
-
-
-def test_noise_realisations_are_a_stage_of_their_own(
-    local: InProcess, image_file: Path, psf_file: Path
-) -> None:
-    told: list[tuple[str, int, int]] = []
-    local.deconvolve(
-        image_file,
-        psf_id=local.upload_psf(psf_file)["id"],
-        steps=2,
-        noise=(5.0, 2.0),
-        error_draws=3,
-        progress=lambda *progress: told.append(progress),
-    )
-    draws = [step for stage, step, steps in told if stage == "error estimate" and steps == 3]
-    assert draws == [0, 0, 1, 2, 3]
-    last = told.index(("deconvolving", 2, 2))
-    assert told[last + 1] == ("error estimate", 0, 3), "at once, before the first of them is done"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,9 +18,7 @@ from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Part, Parts
 from workers.catalogue.tables import JobRow, PartRow
 from workers.contract.jobs import Phase
-from workers.files.store import Store
 from workers.run.runner import Runner
-from workers.settings import Settings
 from workers.tasks import crossval as crossval_task
 
 ALL = [(run, fold) for run in range(3) for fold in range(3)]
@@ -51,16 +48,8 @@ def job_id(local: InProcess, tmp_path: Path) -> str:
     return str(local.submit("cross-validate", transit_id=transit_id, scheme="exact", runs=3)["id"])
 
 
-@pytest.fixture
-def catalogue(local: InProcess, settings: Settings) -> Iterator[Catalogue]:
-    """With the tables that the local service made."""
-    catalogue = Catalogue(settings.catalogue_url)
-    yield catalogue
-    catalogue.close()
-
-
 def test_a_killed_worker_loses_no_fold_and_no_fold_counts_twice(
-    settings: Settings, catalogue: Catalogue, job_id: str, quick: None, monkeypatch: pytest.MonkeyPatch
+    local: InProcess, job_id: str, quick: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     done: list[tuple[int, int]] = []
     cheap = crossval_task.exact_fit
@@ -78,21 +67,23 @@ def test_a_killed_worker_loses_no_fold_and_no_fold_counts_twice(
     monkeypatch.setattr(crossval_task, "exact_fit", counted)
     # A killed process gives nothing back: the fold stays taken until its lease is over.
     monkeypatch.setattr(Parts, "release", lambda self, part: None)
-    runner = Runner(settings, catalogue, Store(settings.data_dir))
+    runner = Runner(local.settings, local.catalogue, local.store)
     with pytest.raises(Killed):
         runner.run(job_id)
-    long_s = 2 * settings.lease_s
+    long_s = 2 * local.settings.lease_s
     for table in (JobRow, PartRow):
-        change(catalogue, update(table).values(heartbeat_at=table.heartbeat_at - long_s))
-    assert catalogue.jobs.give_up_silent(settings.lease_s, settings.max_attempts) == [job_id]
+        change(local.catalogue, update(table).values(heartbeat_at=table.heartbeat_at - long_s))
+    assert local.catalogue.jobs.give_up_silent(local.settings.lease_s, local.settings.max_attempts) == [
+        job_id
+    ]
     runner.run(job_id)
-    row = job_row(catalogue, job_id)
+    row = job_row(local.catalogue, job_id)
     assert (row.phase, row.attempt) == (Phase.COMPLETED, 2)
     assert sorted(fold for fold in done if fold != (-1, -1)) == ALL, "each once"
 
 
 def test_another_worker_shares_the_folds(
-    settings: Settings, catalogue: Catalogue, job_id: str, quick: None, monkeypatch: pytest.MonkeyPatch
+    local: InProcess, job_id: str, quick: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cheap = crossval_task.exact_fit
     by_thread: dict[str, list[tuple[int, int]]] = {}
@@ -111,19 +102,19 @@ def test_another_worker_shares_the_folds(
 
     def call_for_help(job_id: str, workers: int) -> None:
         def help_out() -> None:
-            Runner(settings, Catalogue(settings.catalogue_url), Store(settings.data_dir)).assist(job_id)
+            Runner(local.settings, Catalogue(local.settings.catalogue_url), local.store).assist(job_id)
 
         calls.append(workers)
         helpers.append(threading.Thread(target=help_out, name="helper"))
         helpers[-1].start()
 
-    Runner(settings, catalogue, Store(settings.data_dir), call_for_help).run(job_id)
+    Runner(local.settings, local.catalogue, local.store, call_for_help).run(job_id)
     helpers[0].join()
-    row = job_row(catalogue, job_id)
+    row = job_row(local.catalogue, job_id)
     assert row.phase == Phase.COMPLETED
     assert calls == [len(ALL) - 1] and len(by_thread) == 2
     assert sorted(fold for folds in by_thread.values() for fold in folds) == ALL
-    Runner(settings, catalogue, Store(settings.data_dir)).assist(job_id)  # too late: nothing to do
+    Runner(local.settings, local.catalogue, local.store).assist(job_id)  # too late: nothing to do
 
 
 def test_a_part_gets_one_result_from_several_workers(catalogue: Catalogue) -> None:

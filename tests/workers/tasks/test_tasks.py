@@ -1,4 +1,4 @@
-"""Tasks as functions on a temporary store: right results and clear errors."""
+"""Tasks as functions on a temporary store: right results, warnings and clear errors."""
 
 from __future__ import annotations
 
@@ -12,18 +12,16 @@ import pytest
 from astropy.io import fits
 
 from psfcore.deconvolve import conditions, run, work
+from psfcore.deconvolve.assess import pictures
+from psfcore.deconvolve.assess.changes import QualityBit
 from psfcore.deconvolve.methods.registry import method_names
-from psfcore.errors import DataError
+from psfcore.drawing import plots
 from service.client.http import ServiceError
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
 from tests.in_process import InProcess
 from tests.workers.jobs import job_row
-from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.tables import DEFAULT_OWNER, ProductRow
 from workers.contract.jobs import Phase
 from workers.contract.requests import METHODS
-from workers.files.store import Store
-from workers.run import attempt
 from workers.run.runner import Runner
 from workers.settings import Settings, software_version
 from workers.tasks import deconvolve as deconvolve_task
@@ -40,35 +38,34 @@ OF_INPUT = {
 }
 
 
-def test_a_product_names_its_inputs_and_keeps_the_header(
-    local: InProcess, image_file: Path, psf_file: Path, tmp_path: Path
+def test_a_product_names_its_inputs_keeps_the_header_and_is_not_computed_again(
+    local: InProcess, image_file: Path, psf_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     psf, steps = local.upload_psf(psf_file), []
-    product = local.deconvolve(
-        image_file,
-        tmp_path / "out.fits",
-        psf_id=psf["id"],
-        preview=tmp_path / "p.png",
-        progress=lambda *step: steps.append(step),
-    )
-    assert [step for stage, step, all_steps in steps if stage == "deconvolving"] == list(range(1, 21))
+    options = {"psf_id": psf["id"], "noise": (6.0, 2.0), "error_draws": 3}
+    files = {"output": tmp_path / "out.fits", "preview": tmp_path / "p.png"}
+    product = local.deconvolve(image_file, **files, **options, progress=lambda *step: steps.append(step))
+    assert [step for stage, step, _ in steps if stage == "deconvolving"] == list(range(1, 21))
+    draws = [step for stage, step, of in steps if stage == "error estimate" and of == 3]
+    assert draws == [0, 0, 1, 2, 3]
+    last = steps.index(("deconvolving", 20, 20))
+    assert steps[last + 1] == ("error estimate", 0, 3), "at once, before the first of them is done"
     with fits.open(tmp_path / "out.fits", checksum=True) as hdus:
         header, pixels = hdus[0].header, hdus[0].data
     assert header["PSFID"] == psf["id"] and header["PSFVERS"] == psf["version"]
     assert header["INPSHA"] == product["image_id"] and header["PRODID"] == product["id"]
     assert header["DCNVMETH"] == "richardson-lucy" and header["DCNVITER"] == 20
     assert header["TELESCOP"] == "TEST" and header["XPOSURE"] == 2.0
-    assert "CHECKSUM" in header and "DATASUM" in header
     before = fits.getdata(image_file)
     assert pixels.shape == before.shape
     assert pixels.max() > 1.2 * before.max()
     assert pixels.sum() == pytest.approx(before.sum(), rel=1e-4)
     assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
+    monkeypatch.delattr(deconvolve_task, "make")
+    assert local.deconvolve(image_file, **options) == product
 
 
-def test_a_product_does_not_pass_for_its_input_and_equal_requests_give_equal_bytes(
-    local: InProcess, psf_file: Path, tmp_path: Path
-) -> None:
+def test_equal_requests_give_equal_bytes(local: InProcess, psf_file: Path, tmp_path: Path) -> None:
     write_image(tmp_path / "image.fits", **OF_INPUT)
     (tmp_path / "other name.fits").write_bytes((tmp_path / "image.fits").read_bytes())
     second = InProcess(Settings.apart(tmp_path / "second"))
@@ -91,15 +88,6 @@ def test_a_product_does_not_pass_for_its_input_and_equal_requests_give_equal_byt
     assert header["DATE-BEG"] == OF_INPUT["DATE-BEG"]
     history = list(header["HISTORY"])
     assert product["image_id"] in history and f"input DATE: {OF_INPUT['DATE']}" in history
-
-
-def test_an_identical_request_is_not_computed_again(
-    local: InProcess, image_file: Path, psf_file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    psf_id = local.upload_psf(psf_file)["id"]
-    first = local.deconvolve(image_file, psf_id=psf_id)
-    monkeypatch.delattr(deconvolve_task, "make")
-    assert local.deconvolve(image_file, psf_id=psf_id) == first
 
 
 @pytest.mark.parametrize("threads", [1, 2])
@@ -126,29 +114,11 @@ def test_a_worker_with_one_thread_draws_in_that_thread(
     assert (of_threads["draw_preview"] == of_threads["measure_changes"]) == (threads == 1)
 
 
-def test_a_job_redelivered_after_its_end_does_nothing(
-    local: InProcess, settings: Settings, image_file: Path, psf_file: Path
-) -> None:
-    image_id, psf_id = local.upload_image(image_file)["id"], local.upload_psf(psf_file)["id"]
-    job = local.wait(local.submit("deconvolve", image_id=image_id, psf_id=psf_id))
-    local.wait(job)
-    rows = Catalogue(settings.catalogue_url).page(ProductRow, owner=DEFAULT_OWNER, limit=10)
-    assert len(rows) == 1
-    assert local.wait(job)["attempt"] == 1
-
-
-def test_files_that_cannot_be_used_are_the_users_error(
-    local: InProcess, psf_file: Path, tmp_path: Path
-) -> None:
-    psf_id = local.upload_psf(psf_file)["id"]
-    for code, value in (("all-nan", np.nan), ("no-signal", 0.0)):
-        fits.PrimaryHDU(np.full((64, 64), value, "f4")).writeto(tmp_path / f"{code}.fits")
-        with pytest.raises(ServiceError, match="expected") as caught:
-            local.deconvolve(tmp_path / f"{code}.fits", psf_id=psf_id)
-        assert caught.value.code == code
-    write_psf(tmp_path / "three.fits", scale=3.0)
-    with pytest.raises(DataError, match="expected"):
-        local.upload_psf(tmp_path / "three.fits")
+def test_a_file_that_cannot_be_used(local: InProcess, psf_file: Path, tmp_path: Path) -> None:
+    fits.PrimaryHDU(np.full((64, 64), np.nan, "f4")).writeto(tmp_path / "i.fits")
+    with pytest.raises(ServiceError, match="expected") as caught:
+        local.deconvolve(tmp_path / "i.fits", psf_id=local.upload_psf(psf_file)["id"])
+    assert caught.value.code == "all-nan"
 
 
 def test_a_built_psf_carries_its_provenance(local: InProcess, tmp_path: Path) -> None:
@@ -165,29 +135,6 @@ def test_a_built_psf_carries_its_provenance(local: InProcess, tmp_path: Path) ->
     assert (tmp_path / "psf.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_cancelled_job_stops_at_its_next_step(
-    local: InProcess, settings: Settings, psf_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(attempt, "REPORT_EVERY_S", 0.0)
-    write_image(tmp_path / "i.fits")
-    image_id, psf_id = local.upload_image(tmp_path / "i.fits")["id"], local.upload_psf(psf_file)["id"]
-    job = local.submit("deconvolve", image_id=image_id, psf_id=psf_id)
-    catalogue = Catalogue(settings.catalogue_url)
-    steps: list[int] = []
-
-    def cancel_at_five(stage: str, step: int, _steps: int) -> None:
-        steps.append(step)
-        if (stage, step) == ("deconvolving", 5):
-            catalogue.jobs.cancel(job["id"])
-
-    with pytest.raises(ServiceError, match="cancelled"):
-        local.wait(job, progress=cancel_at_five)
-    row = job_row(catalogue, job["id"])
-    assert row.phase == Phase.ABORTED
-    assert max(steps) == 5
-    assert catalogue.page(ProductRow, owner=DEFAULT_OWNER, limit=1) == []
-
-
 def test_a_transient_failure_is_retried_a_limited_number_of_times(
     local: InProcess, settings: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -196,15 +143,18 @@ def test_a_transient_failure_is_retried_a_limited_number_of_times(
 
     monkeypatch.setattr("workers.tasks.psf_build.psf_build", away)
     job = local.submit("psf-build", instrument="hri_euv", size=64)
-    catalogue = Catalogue(settings.catalogue_url)
     phases = []
-    runner = Runner(settings, catalogue, Store(settings.data_dir))
+    runner = Runner(settings, local.catalogue, local.store)
     for _ in range(settings.max_attempts):
         runner.run(job["id"])
-        row = job_row(catalogue, job["id"])
+        row = job_row(local.catalogue, job["id"])
         phases.append(row.phase)
     assert phases == [Phase.QUEUED] * (settings.max_attempts - 1) + [Phase.ERROR]
     assert row.error is not None and row.error["fault"] == "transient"
+    runner.run(job["id"])
+    assert job_row(local.catalogue, job["id"]).attempt == row.attempt, (
+        "a message that comes again does nothing"
+    )
 
 
 def test_an_unexpected_exception_is_an_internal_error_and_is_logged(
@@ -220,9 +170,7 @@ def test_an_unexpected_exception_is_an_internal_error_and_is_logged(
     assert "Traceback" in caplog.text
 
 
-def test_every_method_of_the_contract_runs_and_says_what_it_did(
-    local: InProcess, psf_file: Path, tmp_path: Path
-) -> None:
+def test_every_method_runs_and_says_so(local: InProcess, psf_file: Path, tmp_path: Path) -> None:
     assert sorted(METHODS) == method_names(), "the contract holds the methods that psfcore has"
     psf_id = local.upload_psf(psf_file)["id"]
     write_image(tmp_path / "i.fits", shape=(64, 64))
@@ -248,9 +196,7 @@ def with_card(path: Path, card: bytes, **cards: object) -> Path:
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_a_formula_as_a_name_and_a_damaged_card_do_not_lose_the_product(
-    local: InProcess, tmp_path: Path
-) -> None:
+def test_formulas_and_damaged_cards_lose_no_product(local: InProcess, tmp_path: Path) -> None:
     image = with_card(tmp_path / "image.fits", b"INSTRUME= 3 2 x", DETECTOR="$\\frac{$")
     write_psf(tmp_path / "psf.fits")
     fits.setval(tmp_path / "psf.fits", "PSFNAME", value="$\\frac{$")
@@ -272,3 +218,61 @@ def test_jobs_share_prepared_psfs(local: InProcess, tmp_path: Path, monkeypatch:
         write_image(tmp_path / f"{seed}.fits", seed=seed)
         local.deconvolve(tmp_path / f"{seed}.fits", psf_id=psf_id, steps=2)
     assert len(engines) == 1
+
+
+# Warnings -------------------------------------------------------------------------------------------
+
+
+AIA = {"TELESCOP": "SDO/AIA", "INSTRUME": "AIA_3", "WAVELNTH": 171}
+FEW = {"steps": 2}
+
+
+def test_saturation_seen_in_the_pixels(local: InProcess, psf_file: Path, tmp_path: Path) -> None:
+    write_image(tmp_path / "i.fits")
+    pixels, cards = fits.getdata(tmp_path / "i.fits"), fits.getheader(tmp_path / "i.fits")
+    fits.writeto(tmp_path / "i.fits", np.minimum(pixels, 120.0).astype("f4"), cards, overwrite=True)
+    product = local.deconvolve(
+        tmp_path / "i.fits", tmp_path / "o.fits", psf_id=local.upload_psf(psf_file)["id"], **FEW
+    )
+    full = fits.getdata(tmp_path / "i.fits") == 120.0
+    with fits.open(tmp_path / "o.fits") as hdus:
+        header, quality = hdus[0].header, hdus["QUALITY"].data
+    np.testing.assert_array_equal((quality & QualityBit.SATURATED) > 0, full)
+    band = product["details"]["edge_band_px"]
+    inner = quality[band:-band, band:-band] if band else quality
+    assert np.count_nonzero(inner == 0) > 0.8 * inner.size, "a good pixel has quality 0"
+    assert (header["DCNVSATL"], header["DCNVSATF"]) == (120.0, "pixels")
+    assert product["details"]["saturation"] == {"level": 120.0, "unit": "DN/s", "found": "pixels"}
+    assert product["details"]["masked_pixels"]["saturated"] == np.count_nonzero(full) > 10
+
+
+def test_warnings_about_the_inputs_are_in_header_and_details(local: InProcess, tmp_path: Path) -> None:
+    write_image(tmp_path / "i.fits", **{**AIA, "WAVELNTH": 193}, NSATPIX=7)
+    write_psf(tmp_path / "p.fits")
+    fits.writeto(tmp_path / "p.fits", fits.getdata(tmp_path / "p.fits"), fits.Header(AIA), overwrite=True)
+    psf_id = local.upload_psf(tmp_path / "p.fits")["id"]
+    product = local.deconvolve(
+        tmp_path / "i.fits", tmp_path / "o.fits", psf_id=psf_id, other_channel=True, **FEW
+    )
+    assert {warning["code"] for warning in product["details"]["warnings"]} == {"saturation", "channel"}
+    history = "".join(str(line) for line in fits.getheader(tmp_path / "o.fits")["HISTORY"])
+    assert "WARNING (saturation): NSATPIX counts 7 saturated pixels" in history
+    assert "WARNING (channel)" in history and "193 angstrom" in history
+
+
+def test_pictures_name_the_unit_of_the_image(
+    local: InProcess, image_file: Path, psf_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    units: list[str] = []
+    for module, name in ((plots, "preview_png"), (pictures, "changes_png")):
+        real = getattr(module, name)
+
+        def noted(*arguments: Any, real: Any = real, **named: Any) -> None:
+            units.append(named["unit"])
+            real(*arguments, **named)
+
+        monkeypatch.setattr(module, name, noted)
+    fits.setval(image_file, "BUNIT", value="DN")
+    psf_id = local.upload_psf(psf_file)["id"]
+    local.deconvolve(image_file, psf_id=psf_id, changes=tmp_path / "changes.png", **FEW)
+    assert units == ["DN in 2 s"] * 2

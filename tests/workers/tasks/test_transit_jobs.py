@@ -161,9 +161,7 @@ def test_an_identical_request_gets_the_existing_result(
 
 
 @pytest.mark.slow
-def test_a_rerun_inverts_anew_and_gives_the_same_fit_bit_for_bit(
-    service: InProcess, fitted: dict[str, Any], inversions: list[int]
-) -> None:
+def test_a_rerun_inverts_anew(service: InProcess, fitted: dict[str, Any], inversions: list[int]) -> None:
     before, psf_id = list(inversions), fitted["psf"]["id"]
     row = service.get(service.wait(service.submit("rerun", of="psf", id=psf_id))["result"])
     assert len(inversions) == len(before) + 1
@@ -172,7 +170,7 @@ def test_a_rerun_inverts_anew_and_gives_the_same_fit_bit_for_bit(
     assert service.get(f"/v1/psfs/{psf_id}")["created_at"] == fitted["psf"]["created_at"]
 
 
-def test_a_deconvolution_with_it_carries_the_psfs_own_error(
+def test_a_product_has_the_error_of_its_psf(
     service: InProcess, fitted: dict[str, Any], tmp_path: Path
 ) -> None:
     image = tmp_path / "image.fits"
@@ -193,9 +191,7 @@ def changed(transit: Path, folder: Path, **changes: Any) -> Path:
     return folder
 
 
-def test_a_transit_that_cannot_be_fitted_is_an_error_of_its_user(
-    service: InProcess, transit: Path, tmp_path: Path
-) -> None:
+def test_a_transit_that_cannot_be_fitted(service: InProcess, transit: Path, tmp_path: Path) -> None:
     images = json.loads((transit / "transit.json").read_text())["images"]
     elsewhere = [image | {"x": 64.0, "y": 110.0} for image in images]
     with pytest.raises(ServiceError) as caught:
@@ -214,9 +210,7 @@ def test_a_transit_of_one_pointing_states_a_limit(service: InProcess, transit: P
 # Cross-validation -------------------------------------------------------------------------------------
 
 
-def test_a_cross_validation_says_what_was_done_and_compares_with_a_fit_without_a_formula(
-    folds: dict[str, Any],
-) -> None:
+def test_a_cross_validation_compares_with_a_fit_without_a_formula(folds: dict[str, Any]) -> None:
     assert folds["exact"]["folds"] == folds["shared"]["folds"]
     for scheme, report in folds.items():
         assert sorted(int(n) for fold in report["folds"] for n in fold["held_out_pct"]) == list(range(9))
@@ -249,21 +243,14 @@ def test_the_report_says_what_was_found_and_what_it_was_made_of(report: dict[str
     assert abs(total["value"] - TRUTH.total) < 4 * total["sigma"]
     assert content["shapes"] == {"shapes": "compared"}
     assert report["given"] == [("Solution", 3)], "the comparison starts from the fit and its seed"
-
-
-def test_its_page_stands_alone_and_shows_every_image(report: dict[str, Any]) -> None:
     html = (report["folder"] / "r.html").read_text("utf-8")
     check_stands_alone(html)
     cells = {tag.text for tag in read_page(html) if tag.name == "td"}
-    assert {frame["file"] for frame in report["json"]["evaluation"]["frames"]} <= cells
-    assert set(report["json"]["inputs"]["sha256"].values()) <= cells
-    assert "the effect of wrong dark levels" in html and "not requested" in html
+    assert {frame["file"] for frame in content["evaluation"]["frames"]} <= cells
     assert (report["folder"] / "r.png").read_bytes().startswith(PNG)
 
 
-def test_a_given_psf_is_evaluated_without_a_fit_and_without_diffraction(
-    service: InProcess, transit: Path, tmp_path: Path
-) -> None:
+def test_a_given_psf_is_evaluated_without_a_fit(service: InProcess, transit: Path, tmp_path: Path) -> None:
     folder = changed(transit, tmp_path / "t", known_psf=None, instrument=None)
     fits.PrimaryHDU(total_kernel(TRUTH, diffraction(), REACH_GRID_PX)).writeto(tmp_path / "true.fits")
     psf_id = service.upload_psf(tmp_path / "true.fits")["id"]
