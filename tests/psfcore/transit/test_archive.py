@@ -227,7 +227,7 @@ def test_too_many_and_too_large_members_are_refused(folder: Path, tmp_path: Path
     refused(hidden, tmp_path / "out", "archive-too-large", SMALL)
 
 
-def test_links_and_devices_in_a_tar_are_refused(folder: Path, tmp_path: Path) -> None:
+def test_links_and_devices_are_refused(folder: Path, tmp_path: Path) -> None:
     path = tmp_path / "a.tar"
     links, devices = (tarfile.SYMTYPE, tarfile.LNKTYPE), (tarfile.CHRTYPE, tarfile.BLKTYPE, tarfile.FIFOTYPE)
     for kind in (*links, *devices, b"S", b"Z"):
@@ -237,10 +237,7 @@ def test_links_and_devices_in_a_tar_are_refused(folder: Path, tmp_path: Path) ->
             link.type, link.linkname = kind, "/etc/passwd"
             out.addfile(link)
         refused(path, tmp_path / "out", "archive-not-plain")
-
-
-def test_links_and_devices_in_a_zip_are_refused(folder: Path, tmp_path: Path) -> None:
-    """In a folder beside the transit, too."""
+    # In a folder beside the transit, too.
     kinds, names = (stat.S_IFLNK, stat.S_IFCHR, stat.S_IFIFO), ("x.fits", "x/", "beside/x.fits")
     for kind, name in itertools.product(kinds, names):
         path = as_zip(tmp_path / "a.zip", members_of(folder))
@@ -333,13 +330,6 @@ def test_a_gzip_with_a_long_name_is_refused(folder: Path, tmp_path: Path) -> Non
     tar = as_tar(tmp_path / "a.tar", members_of(folder)).read_bytes()
     (tmp_path / "a.tar.gz").write_bytes(gzip_named(tar, 2**17))
     refused(tmp_path / "a.tar.gz", tmp_path / "out", "archive-broken")
-
-
-def test_skipped_members_of_a_gzip_count(tmp_path: Path) -> None:
-    """Ninety hidden members are skipped, but must be inflated."""
-    inside = b"".join(tar_header(f".{i}", 100_000) + bytes(100_352) for i in range(90))
-    path = endless_gz(tmp_path / "a.tar.gz", inside, mib=0)
-    refused(path, tmp_path / "out", "archive-too-large", ArchiveLimits(max_bytes=4 * MIB))
 
 
 def test_an_endless_name_is_refused(tmp_path: Path) -> None:
@@ -576,6 +566,5 @@ def test_all_bad_files_are_named_in_one_error_and_nothing_is_written(folder: Pat
             assert name in caught.value.message
         assert "000.fits" not in caught.value.message
     assert not (tmp_path / "t.tar").exists()
-    with pytest.raises(DataError) as caught:
+    with pytest.raises(DataError, match="no-manifest"):
         transit_in(tmp_path)
-    assert caught.value.code == "no-manifest"
