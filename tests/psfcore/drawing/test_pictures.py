@@ -42,7 +42,7 @@ def lightness(levels: np.ndarray) -> np.ndarray:
     return np.where(y > (6 / 29) ** 3, 116 * np.cbrt(y) - 16, y * (29 / 3) ** 3)
 
 
-def test_a_brighter_level_is_lighter() -> None:
+def test_a_brighter_level_is_lighter_and_none_looks_like_a_pixel_without_data() -> None:
     white_grey_black = np.array([[255, 255, 255], [119, 119, 119], [0, 0, 0]])
     assert lightness(white_grey_black) == pytest.approx([100.0, 50.0, 0.0], abs=0.1)
     for count in (256, 255):
@@ -50,20 +50,14 @@ def test_a_brighter_level_is_lighter() -> None:
         assert levels.shape == (count, 3) and levels.dtype == np.uint8
         assert np.diff(lightness(levels)).min() > 0
         assert lightness(levels)[[0, -1]] == pytest.approx([0, 99], abs=1)
-
-
-def test_the_levels_pass_through_the_control_points_and_are_the_map_of_the_plots() -> None:
+    red, _, blue = rgb(NO_DATA)
+    assert blue > red and (euv_levels()[:, 0] >= euv_levels()[:, 2]).all()
     levels = euv_levels(1001)
     assert [tuple(levels[round(share * 1000)]) for share, _ in EUV_POINTS] == [
         rgb(colour) for _, colour in EUV_POINTS
     ]
     drawn = GOLD(np.arange(256), bytes=True)[:, :3].astype(int)
     assert np.abs(drawn - euv_levels()).max() <= 1  # Matplotlib rounds otherwise
-
-
-def test_no_level_looks_like_a_pixel_without_data() -> None:
-    red, _, blue = rgb(NO_DATA)
-    assert blue > red and (euv_levels()[:, 0] >= euv_levels()[:, 2]).all()
 
 
 # --- units -----------------------------------------------------------------------------------------------
@@ -164,7 +158,7 @@ def colour_at(path: Path, x: float, y: float) -> np.ndarray:
     return np.asarray(picture[int(y * picture.shape[0]), int(x * picture.shape[1]), :3])
 
 
-def test_the_change_panel_is_red_for_more_light_and_blue_for_less(tmp_path: Path) -> None:
+def test_the_change_panel_is_red_for_more_light_and_before_and_after_have_one_stretch(tmp_path: Path) -> None:
     before = np.full((128, 128), 100.0)
     after = before.copy()
     after[:, :64] = 180.0
@@ -173,16 +167,10 @@ def test_the_change_panel_is_red_for_more_light_and_blue_for_less(tmp_path: Path
     gained, lost = (colour_at(tmp_path / "p.png", x, 0.5) for x in (0.72, 0.90))
     assert gained[0] > 0.6 > gained[2]
     assert lost[2] > lost[0]
-
-
-def test_before_and_after_use_the_same_stretch(tmp_path: Path) -> None:
     plane = np.random.default_rng(0).random((64, 64)) + 1
     preview_png(plane, plane, tmp_path / "p.png", title="same", unit="DN")
     left, right = (colour_at(tmp_path / "p.png", x, 0.5) for x in (0.1, 0.1 + 0.318))
     np.testing.assert_allclose(left, right, atol=0.02)
-
-
-def test_any_shape_and_missing_pixels_are_drawn(tmp_path: Path) -> None:
     for shape in ((16, 16), (33, 900)):
         before = np.ones(shape)
         before[0, 0], before[1, 1] = np.nan, -4.0
