@@ -51,7 +51,7 @@ def by_name(compared: tuple[ComparedShape, ...]) -> dict[str, ComparedShape]:
     return {shape.name: shape for shape in compared}
 
 
-def test_a_simulated_stretch_is_found() -> None:
+def test_a_simulated_stretch_is_found_and_gains_most() -> None:
     """To first order, near the best fit without a stretch."""
     log, turn = math.log(1.15), math.radians(2 * -15.0)
     found = compared_stretched()["stretched"].added
@@ -59,9 +59,6 @@ def test_a_simulated_stretch_is_found() -> None:
         value, sigma = found[name]
         assert abs(value - true) < 3 * sigma
         assert abs(value) > 8 * sigma
-
-
-def test_the_simulated_shape_gains_most() -> None:
     compared = compared_stretched()
     by_gain = sorted(compared, key=lambda name: -compared[name].gain)
     held_out = {name: shape.held_out_gain or 0.0 for name, shape in compared.items()}
@@ -234,7 +231,7 @@ def test_an_offset_is_divided_by_the_exposure() -> None:
         )
 
 
-def test_a_positive_offset_is_fitted_as_more_scatter() -> None:
+def test_a_positive_offset_is_fitted_as_more_scatter_and_weights_change_as_the_formulas_do() -> None:
     study = offsets()
     low, high = study.offsets
     assert (low.offset_dn, high.offset_dn) == (-5.0, 5.0)
@@ -250,10 +247,6 @@ def test_a_positive_offset_is_fitted_as_more_scatter() -> None:
     changes = [np.abs(o.weight_change_pct).max() for o in study.offsets]
     assert study.largest("weight_change_pct") == max(changes) > 2
     assert 0.5 < study.largest("curve_change_points") < 4
-
-
-def test_weights_change_as_the_fitted_formulas_do() -> None:
-    study = offsets()
     nominal, other = ({**v} for v in (study.nominal, study.offsets[1].values))
     kernels = [SOFTENED_POWER_LAW.kernel(SOFTENED_POWER_LAW.coordinates(v), 512) for v in (other, nominal)]
     at = np.flatnonzero(study.radii_px == 20)[0]
