@@ -70,13 +70,6 @@ def test_it_agrees_with_the_residuals_of_the_inversion() -> None:
         assert here.observed_dn_s == pytest.approx(there.observed, rel=1e-4)
 
 
-def test_threads_change_nothing() -> None:
-    one, two = judged(), evaluate(noise_free(sky()), lambda _: kernel_with(), threads=2)
-    for a, b in zip(one.frames, two.frames, strict=True):
-        np.testing.assert_array_equal(a.simulated, b.simulated)
-    np.testing.assert_array_equal(one.superposed.noise_mape_pct, two.superposed.noise_mape_pct)
-
-
 def test_residuals_scatter_by_their_stated_noise() -> None:
     """For 108 discs, the width of the pulls is known to 7 %."""
     frames = [frame for seed in SEEDS for frame in noisy(seed).frames]

@@ -25,6 +25,7 @@ from psfcore.evaluation.shapes import (
 from psfcore.evaluation.summary_lines import summary_lines
 from psfcore.scatter.inversion import invert
 from psfcore.scatter.shapes import SHAPES
+from psfcore.scatter.validation.cross_validation import FoldSample, shared_step
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.scatter_truth import ScatterTruth
 from psfcore.simulate.transit import simulate
@@ -41,7 +42,7 @@ def compared() -> ShapesByErrors:
         return compare_shapes_by_errors(solved())
 
 
-def test_all_shapes_are_compared_on_the_same_images() -> None:
+def test_all_shapes_are_compared_on_the_same_images_by_the_figures_of_the_evaluation() -> None:
     found = compared()
     said = json.loads(json.dumps(found.to_json(), allow_nan=False))
     assert said["shapes"][1]["parameters"]["bend"]["sigma"] > 0
@@ -55,6 +56,14 @@ def test_all_shapes_are_compared_on_the_same_images() -> None:
     for name in FIGURES:
         difference = second.figures[name][0] - first.figures[name][0]
         assert second.minus_first[name][0] == pytest.approx(difference, abs=1e-9)
+    # Those of the power law agree with the superposed maps of its held-out PSFs.
+    looked = evaluate(solved().transit, held_out_kernels(solved()), noise_realisations=0)
+    figures = compared().shapes[0].figures
+    residual = np.array([frame.residual_pct for frame in looked.frames])
+    assert figures["residual_mean_pct"][0] == pytest.approx(residual.mean())
+    assert figures["residual_rms_pct"][0] == pytest.approx(np.sqrt((residual**2).mean()))
+    assert figures["mpe_rms_pct"][0] == pytest.approx(looked.superposed.mpe_rms_pct)
+    assert figures["mape_mean_pct"][0] == pytest.approx(looked.superposed.mape_mean_pct)
 
 
 @pytest.mark.slow
@@ -78,17 +87,6 @@ def test_shapes_do_not_differ_where_the_truth_is_isotropic() -> None:
             assert sigma < shape.figures[name][1]  # the same images: better known than the figures themselves
 
 
-def test_figures_are_those_of_the_evaluation() -> None:
-    """Those of the power law agree with the superposed maps of its held-out PSFs."""
-    looked = evaluate(solved().transit, held_out_kernels(solved()), noise_realisations=0)
-    figures = compared().shapes[0].figures
-    residual = np.array([frame.residual_pct for frame in looked.frames])
-    assert figures["residual_mean_pct"][0] == pytest.approx(residual.mean())
-    assert figures["residual_rms_pct"][0] == pytest.approx(np.sqrt((residual**2).mean()))
-    assert figures["mpe_rms_pct"][0] == pytest.approx(looked.superposed.mpe_rms_pct)
-    assert figures["mape_mean_pct"][0] == pytest.approx(looked.superposed.mape_mean_pct)
-
-
 def test_other_shapes_and_few_images_are_refused() -> None:
     knee = dataclasses.replace(solved().inversion, shape=SHAPES["knee"])
     with pytest.raises(DataError, match=r"unknown-shape.*softened-power-law.*knee"):
@@ -105,6 +103,10 @@ def test_every_image_has_the_psf_of_the_fold_that_holds_it_out() -> None:
     assert len(parts) == 4
     of_fold = [kernels(fold.held_out[0]) for fold in parts]
     assert len({id(kernel) for kernel in of_fold}) == 4
+    counts = tuple(int(n in parts[1].fitted) for n in range(IMAGES))
+    step = shared_step(solved(), FoldSample(0, 1, counts, parts[1].held_out))
+    expected = solved().total.kernel(solved().inversion.coordinates + step)
+    np.testing.assert_array_equal(of_fold[1], expected)
     for fold, kernel in zip(parts, of_fold, strict=True):
         assert all(kernels(n) is kernel for n in fold.held_out)
     found = evaluate(observed(sky()).transit, kernels)
