@@ -43,7 +43,9 @@ def test_a_quantity_counts_as_the_number_in_the_documented_unit(psf: heliopsf.Ps
 WRONG: list[tuple[dict[str, Any], str]] = [
     ({"noise": 5}, "bad-noise"),
     ({"noise": (1 * u.m, 2)}, "bad-quantity"),
+    ({"noise": ("much", 2)}, "bad-quantity"),
     ({"saturation_dn": 5 * u.m}, "bad-quantity"),
+    ({"saturation_dn": [1, 2]}, "bad-quantity"),
     ({"smap": pixels() * u.DN, "saturation_dn": 5 * u.DN / u.s}, "no-exposure"),
     ({"plate_scale_arcsec": 2 * u.kg}, "bad-quantity"),
     ({"iterations": 2.5}, "bad-steps"),

@@ -13,7 +13,6 @@ import pytest
 from psfcore.errors import DataError
 from psfcore.evaluation import shapes
 from psfcore.evaluation.evaluation import evaluate
-from psfcore.evaluation.report import report
 from psfcore.evaluation.shapes import (
     FIGURES,
     FREE_SHELLS,
@@ -22,7 +21,6 @@ from psfcore.evaluation.shapes import (
     compare_shapes_by_errors,
     held_out_kernels,
 )
-from psfcore.evaluation.summary_lines import summary_lines
 from psfcore.scatter.inversion import invert
 from psfcore.scatter.shapes import SHAPES
 from psfcore.scatter.validation.cross_validation import FoldSample, shared_step
@@ -125,16 +123,13 @@ def test_held_out_discs_of_clean_transits_are_predicted() -> None:
     for seed in (0, 1, 2):
         made = simulate(default_plan(30, 512), drawn_truth(seed), hri_diffraction(1024), seed)
         found = evaluate(made.transit, held_out_kernels(invert(made.transit)))
-        print("\n".join(["", f"seed {seed}", *summary_lines(report(found))]))
         for fov in off:
             planes = made.sky.noise_free
             here = [residual_against_pct(f, planes[f.index]) for f in found.frames if f.pointing == fov]
-            print(f"pointing {fov}, discs without noise: mean {np.mean(here):+.2f} %, rms {rms(here):.2f} %")
             assert abs(np.mean(here)) < 1.5 and rms(here) < 2
             off[fov] += here
         maps = found.superposed
         assert maps.mape_mean_pct == pytest.approx(maps.mape_noise_mean_pct, rel=0.05)
         assert maps.mpe_rms_pct == pytest.approx(maps.mpe_noise_rms_pct, rel=0.15)
-    for fov, values in off.items():
-        print(f"pointing {fov} of three transits: mean {np.mean(values):+.2f} %, rms {rms(values):.2f} %")
+    for values in off.values():
         assert abs(np.mean(values)) < 1 and rms(values) < 2

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import Convolver
 from psfcore.errors import DataError
-from psfcore.psf import squared_radii
 from psfcore.scatter.power_law import scatter_kernel
 from psfcore.scatter.segments import Segments, segment_sums, shells_as_published
 
@@ -130,17 +129,6 @@ def test_published_shells_are_ten_five_and_thirty_five_and_hold_the_light_of_the
     segments = Segments(shells_as_published())
     kernel = scatter_kernel(6.15, 2.53, 0.411, 2048)
     assert segments.counts @ segments.mean_of_map(kernel) == pytest.approx(0.411, rel=1e-12)
-
-
-def test_a_pixel_on_an_edge_belongs_to_the_shell_that_begins_there() -> None:
-    label = Segments((1.0, 2.0, 5.0), reach_grid_px=16).label_map(13)
-    r = np.sqrt(squared_radii((13, 13)))
-    expected = np.full(r.shape, -1)
-    expected[(r >= 1) & (r < 2)] = 0
-    expected[(r >= 2) & (r < 5)] = 1
-    np.testing.assert_array_equal(label, expected)
-    assert label[6, 6 + 5] == label[6, 6] == -1
-    assert label[6 + 3, 6 + 4] == -1
 
 
 def test_a_map_of_any_size_is_a_crop_of_the_reach_grid_and_runs_are_its_rows() -> None:
