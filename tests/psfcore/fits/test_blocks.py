@@ -156,7 +156,7 @@ def test_the_first_image_is_used_and_its_cards_are_read(tmp_path: Path, name: st
     assert json.loads(json.dumps(dataclasses.asdict(summary), allow_nan=False))["shape"] == [24, 60]
 
 
-def test_unusable_descriptive_cards_count_as_missing_and_wavelengths_have_units(tmp_path: Path) -> None:
+def test_unusable_cards_count_as_missing_and_units_are_converted(tmp_path: Path) -> None:
     odd = ["CDELT1  = 1E999", "XPOSURE = -1.0", "WAVELNTH= 'long'", "BUNIT   = ''", "DETECTOR= 12"]
     path = tmp_path / "odd.fits"
     path.write_bytes(block(*image_cards(32, 16, 16, *odd, "DATE-OBS= 1 2 3"), data=bytes(1024)))

@@ -8,11 +8,10 @@ import pytest
 from astropy.io import fits
 
 from psfcore.errors import DataError
-from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.channel import channel_differences, check_channel
 from psfcore.fits.psfs import read_psf, write_psf
 from psfcore.psf import Psf
-from tests.psfcore.conftest import gaussian, make_psf
+from tests.psfcore.conftest import LIMITS, gaussian, make_psf
 
 AIA = {"TELESCOP": "SDO/AIA", "INSTRUME": "AIA_3", "WAVELNTH": 171, "WAVEUNIT": "angstrom"}
 HRI = {"TELESCOP": "SOLO/EUI/HRI_EUV", "INSTRUME": "EUI", "DETECTOR": "HRI_EUV", "WAVELNTH": 174}
@@ -80,13 +79,13 @@ def test_another_channel_is_refused_unless_told(subtests: pytest.Subtests) -> No
         assert warning is not None and named in warning and "another channel" in warning
 
 
-def test_a_psf_file_says_what_it_is_for(tmp_path: Path, limits: FitsLimits) -> None:
+def test_a_psf_file_says_what_it_is_for(tmp_path: Path) -> None:
     header = fits.Header({**AIA, "FILTER": "thin"})
     fits.PrimaryHDU(gaussian(32, 1.0).astype("f4"), header).writeto(tmp_path / "other.fits")
-    other = read_psf(tmp_path / "other.fits", limits)
+    other = read_psf(tmp_path / "other.fits", LIMITS)
     assert other.cards == {"TELESCOP": "SDO/AIA", "INSTRUME": "AIA_3", "FILTER": "thin"}
     assert other.wavelength_angstrom == 171.0
     write_psf(tmp_path / "own.fits", AIA_171)
-    own = read_psf(tmp_path / "own.fits", limits)
+    own = read_psf(tmp_path / "own.fits", LIMITS)
     assert own.cards == {} and own.instrument == "aia_171", "INSTRUME is the name of the instrument file here"
     assert check_channel(own, fits.Header(AIA)) is None
