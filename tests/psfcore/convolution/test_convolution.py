@@ -43,11 +43,12 @@ def test_equals_the_sum_and_its_adjoint_for_any_shapes(ny: int, nx: int, ky: int
 
 
 def test_convolving_kernels_keeps_their_sum_and_centre() -> None:
-    both = linear_convolve(gaussian(60, 3.0), gaussian(51, 4.0), (101, 90))
-    np.testing.assert_allclose(both.sum(), 1.0, atol=1e-12)
-    assert np.unravel_index(both.argmax(), both.shape) == (50, 45)
-    y = np.arange(101) - 50
-    np.testing.assert_allclose((both.sum(axis=1) * y**2).sum(), 25.0, rtol=1e-6)
+    for size in (60, 61):
+        both = linear_convolve(gaussian(size, 3.0), gaussian(51, 4.0), (101, 90))
+        np.testing.assert_allclose(both.sum(), 1.0, atol=1e-12)
+        assert np.unravel_index(both.argmax(), both.shape) == (50, 45)
+        y = np.arange(101) - 50
+        np.testing.assert_allclose((both.sum(axis=1) * y**2).sum(), 25.0, rtol=1e-6)
 
 
 def test_single_precision_stays_single_and_close() -> None:
@@ -122,7 +123,7 @@ def test_only_a_symmetric_psf_is_symmetric() -> None:
     assert not Engine(lopsided / lopsided.sum(), (64, 64)).symmetric
 
 
-def test_the_result_does_not_depend_on_the_threads_which_process_every_block_once() -> None:
+def test_the_result_does_not_depend_on_the_threads() -> None:
     rng = np.random.default_rng(0)
     kernel = rng.random((64, 64))
     field = rng.random((300, 200))
