@@ -50,9 +50,7 @@ def a_map(data: np.ndarray | None = None, **more: Any) -> Any:
     return sunpy.map.Map(pixels() if data is None else data, cards(**more))
 
 
-def test_a_map_comes_back_as_a_map_with_its_metadata_and_is_a_product(
-    psf: heliopsf.Psf, tmp_path: Path
-) -> None:
+def test_a_map_comes_back_as_a_map_that_is_a_product(psf: heliopsf.Psf, tmp_path: Path) -> None:
     image = a_map(history="calibrated\nflat-fielded", datamin=1.0, datarms=3.0)
     before = dict(image.meta)
     result = heliopsf.deconvolve(image, psf, iterations=5)
@@ -322,9 +320,7 @@ def test_a_psf_may_be_an_object_a_file_or_weights(psf: heliopsf.Psf, tmp_path: P
         heliopsf.deconvolve(a_map(), {"psf": 1})  # type: ignore[call-overload]
 
 
-def test_calls_of_aiapy_work_unchanged_and_tell_their_progress(
-    psf: heliopsf.Psf, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_calls_of_aiapy_work_unchanged(psf: heliopsf.Psf, capsys: pytest.CaptureFixture[str]) -> None:
     """Names and order of ``aiapy.psf.deconvolve`` (0.10): smap, psf, iterations, clip_negative, use_gpu."""
     names = list(inspect.signature(heliopsf.deconvolve).parameters)
     assert names[:5] == ["smap", "psf", "iterations", "clip_negative", "use_gpu"]
@@ -347,9 +343,7 @@ def test_calls_of_aiapy_work_unchanged_and_tell_their_progress(
 REGION = "32:64,24:56"  # x and y differ
 
 
-def test_a_region_is_its_submap_deconvolved_and_has_the_form_of_its_image(
-    psf: heliopsf.Psf, tmp_path: Path
-) -> None:
+def test_a_region_is_its_submap_in_the_form_of_its_image(psf: heliopsf.Psf, tmp_path: Path) -> None:
     image = a_map(datarms=3.0)
     part = image.submap([32, 24] * u.pix, top_right=[63, 55] * u.pix)
     whole = heliopsf.deconvolve(image, psf)

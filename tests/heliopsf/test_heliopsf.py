@@ -97,7 +97,7 @@ def test_an_image_is_deconvolved_as_the_core_does(tmp_path: Path) -> None:
     assert steps[-1] == (3, 3) and result.steps_done == 3
 
 
-def test_errors_have_a_code_another_channel_is_refused_and_what_is_not_sure_is_a_warning(
+def test_errors_have_a_code_and_what_is_not_sure_is_a_warning(
     tmp_path: Path,
 ) -> None:
     (tmp_path / "text.fits").write_text("no FITS" * 1000)
@@ -167,7 +167,7 @@ def _no_windows() -> Iterator[None]:
     pyplot.close("all")
 
 
-def test_a_psf_and_a_deconvolution_are_drawn_on_given_or_new_axes(psf: heliopsf.Psf, tmp_path: Path) -> None:
+def test_a_psf_and_a_deconvolution_are_drawn(psf: heliopsf.Psf, tmp_path: Path) -> None:
     left, right = Figure().subplots(1, 2)
     assert psf.plot(left, size=33) is left and psf.plot_curve(right) is right
     np.testing.assert_array_equal(left.images[0].get_array(), psf.kernel[16:49, 16:49])
@@ -191,7 +191,7 @@ def test_a_psf_and_a_deconvolution_are_drawn_on_given_or_new_axes(psf: heliopsf.
 TIMES = {"before_time": "2022-03-01", "after_time": "2023-03-01T00:00:00Z"}
 
 
-def test_files_and_psfs_give_the_same_psf_and_wrong_times_and_shapes_are_refused(tmp_path: Path) -> None:
+def test_files_and_psfs_give_the_same_psf_between_two_times(tmp_path: Path) -> None:
     files = [write_fitted(tmp_path / f"{name}.fits", values) for name, values in (("a", EARLY), ("b", LATE))]
     psf = heliopsf.interpolate_psf(*files, **TIMES, time="2022-08-30T12:00:00")
     assert psf.fitted is not None and psf.name == "hri_euv-interpolated"

@@ -198,9 +198,13 @@ def test_commands_print_by_one_function() -> None:
     assert printing == ["progress.py"]
 
 
-def test_the_description_of_the_interface_is_what_the_application_generates() -> None:
+def test_the_interface_and_the_settings_are_described_as_the_code_has_them() -> None:
     kept = (HERE / "openapi" / "openapi.json").read_text()
     assert kept == description(), "`make openapi` writes it anew"
+    from workers.settings_table import settings_table
+
+    kept = (HERE / "docs" / "settings.md").read_text("utf-8")
+    assert kept == settings_table(), "`make settings` writes it anew"
 
 
 def test_the_readme_tells_the_commands_that_ci_runs() -> None:
@@ -319,13 +323,6 @@ def test_every_installed_pin_runs_on_the_oldest_python() -> None:
         if not SpecifierSet(found.metadata.get("Requires-Python", "")).contains(f"{oldest.version}.0")
     }
     assert refused == {}, "pin an older version in constraints.txt"
-
-
-def test_the_page_of_settings_is_made_from_the_settings_class() -> None:
-    from workers.settings_table import settings_table
-
-    kept = (HERE / "docs" / "settings.md").read_text("utf-8")
-    assert kept == settings_table(), "`make settings` writes it anew"
 
 
 @pytest.mark.parametrize("folder", ["benchmarks", "studies"])

@@ -17,7 +17,7 @@ def test_an_array_equals_its_copy_for_any_memory_layout() -> None:
         assert found.sha256[0] == found.sha256[1]
 
 
-def test_a_difference_is_relative_to_the_largest_value_and_none_where_it_is_not_defined() -> None:
+def test_a_difference_is_relative_to_the_largest_value() -> None:
     again = IMAGE.copy()
     again[0, 0] += 0.02
     found = compare(IMAGE, again)
@@ -52,7 +52,7 @@ def test_units_do_not_matter() -> None:
     assert cut[0, 0] < 1e-3 * expected[0, 0]
 
 
-def test_a_direction_that_is_not_determined_has_no_variance_and_others_keep_theirs() -> None:
+def test_an_undetermined_direction_has_no_variance() -> None:
     """The data determine only the sum of two parameters: the sum has a variance, the difference has none."""
     normal = np.array([[4.0, 4.0, 0.0], [4.0, 4.0, 0.0], [0.0, 0.0, 25.0]])
     inverse = scaled_inverse(normal, weakest=1e-9)

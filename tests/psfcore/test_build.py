@@ -87,7 +87,7 @@ def test_scatter_as_two_laws_or_as_a_table() -> None:
     assert kernel[r > table[199][0]].max() == 0 < kernel[r <= table[199][0]].min()
 
 
-def test_the_published_curve_is_met_and_assumptions_are_in_the_provenance(hri_psf: Psf) -> None:
+def test_the_published_curve_is_met_and_assumptions_are_stated(hri_psf: Psf) -> None:
     """56.6 % outside the central pixel; 37, 12 and < 1 % beyond 10, 100 and 1000 px; core weight 0.4335."""
     outside, beyond_10, beyond_100, beyond_1000 = cumulative_curve(hri_psf.kernel, [0.5, 10, 100, 1000])
     assert outside == pytest.approx(56.6, abs=0.2)

@@ -69,7 +69,7 @@ def test_a_kernel_that_cannot_be_written_is_used(tmp_path: Path, caplog: pytest.
     assert "cannot write a compiled kernel" in caplog.text
 
 
-def test_kernels_that_others_can_write_or_rename_are_neither_loaded_nor_written(
+def test_kernels_that_others_can_write_or_rename_are_not_used(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     files = KernelFiles(str(tmp_path), "f.py311", "source")

@@ -49,7 +49,7 @@ def test_a_damaged_file_is_removed_and_not_used(cache: PsfCache) -> None:
     assert list(cache.folder.iterdir()) == []
 
 
-def test_folder_and_files_are_closed_to_other_users_and_a_folder_of_another_user_is_not_used(
+def test_folder_and_files_are_those_of_one_user_alone(
     cache: PsfCache, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cache.folder.mkdir(parents=True)

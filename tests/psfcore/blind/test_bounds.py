@@ -28,7 +28,7 @@ def ideal(**left: float | tuple[float, float]) -> dict[str, Any]:
     }
 
 
-def test_a_test_and_a_decision_have_the_power_of_the_textbook_and_of_simulated_ones() -> None:
+def test_tests_and_decisions_have_the_power_of_simulated_ones() -> None:
     for among, textbook in ((1, {3.84: 0.5, 10.5: 0.9, 18.4: 0.99}), (18, {8.9: 0.5, 18.3: 0.9, 28.2: 0.99})):
         for lam, probability in textbook.items():
             assert excluded(lam, among) == pytest.approx(probability, abs=0.005), (among, lam)
@@ -49,7 +49,7 @@ def test_a_test_and_a_decision_have_the_power_of_the_textbook_and_of_simulated_o
     assert best_of([2 * energy] * rivals) == pytest.approx(right, abs=0.005)
 
 
-def test_the_rivals_of_an_effect_and_of_a_pair_and_of_what_adapts_to_the_data() -> None:
+def test_the_rivals_of_an_effect_of_a_pair_and_of_a_field() -> None:
     found = known(ideal(none=50.0, a=0.2, b=6.0, a__b=0.1), ["a"], ["a"], in_library=True)
     assert (found.noncentrality, found.rival) == (50.0, 6.0)
     assert found.alone == pytest.approx(float(ndtr(np.sqrt(6.0) / 2)), abs=1e-6)

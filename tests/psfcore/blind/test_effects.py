@@ -70,7 +70,7 @@ def test_the_effects_of_the_library_and_two_groups_of_others(plan: Plan) -> None
         effect_named("gremlins")
 
 
-def test_an_effect_changes_images_unless_its_strength_is_0_and_saturation_loses_its_share(
+def test_an_effect_changes_images_unless_its_strength_is_0(
     plan: Plan, effect_free: EffectFree, clean: list[np.ndarray]
 ) -> None:
     dn = Chain(effect_free, ()).read_out(clean, 5)

@@ -111,7 +111,7 @@ def test_the_sun_beside_a_strong_effect_keeps_the_strength_that_was_drawn(tmp_pa
     assert truth["target_pct"][1] is None
 
 
-def test_the_transit_of_a_case_can_be_read_and_contains_nothing_of_the_truth(made: BlindSet) -> None:
+def test_the_transit_of_a_case_contains_nothing_of_the_truth(made: BlindSet) -> None:
     transit = read_transit(made.transit(0), LIMITS)
     assert (len(transit.frames), transit.shape) == (IMAGES, (SIZE_PX, SIZE_PX))
     places = np.array([[frame.place.x_px, frame.place.y_px] for frame in transit.frames])
@@ -176,7 +176,7 @@ def test_the_truth_contains_what_an_effect_leaves_and_a_map_of_the_light_that_it
     assert "light_map" not in made.truth(1)
 
 
-def test_a_clean_case_has_a_transit_alone_and_scenes_can_be_taken_from_images(tmp_path: Path) -> None:
+def test_a_clean_case_has_a_transit_alone_also_of_a_given_scene(tmp_path: Path) -> None:
     truth = make(drawn(4, clean_only=True), tmp_path / "transit", tmp_path / "expected")
     assert (truth["effects"], truth["left_after_refit_pct"]) == ([], 0.0)
     assert truth["clean_left_pct"] < 0.8
@@ -210,9 +210,7 @@ def test_the_ideal_observer_measures_what_the_maker_of_a_case_measured(
     assert left[("intensity_gradient",)] < 0.2 * left[()]
 
 
-def test_seals_catch_a_changed_truth_and_a_set_is_continued_only_with_its_own_plan_and_by_one_run(
-    made: BlindSet, tmp_path: Path
-) -> None:
+def test_a_set_keeps_its_truth_its_plan_and_one_run(made: BlindSet, tmp_path: Path) -> None:
     copy = BlindSet(tmp_path)
     (tmp_path / "truth").mkdir()
     copy.seals_file.write_text(made.seals_file.read_text())

@@ -283,7 +283,7 @@ def test_what_is_right_is_compared_with_what_could_be_known() -> None:
     assert (row["n"], row["value"], row["wilson95"]) == (1, None, None)
 
 
-def test_only_the_effects_that_show_must_be_named_and_a_verdict_states_the_truth_and_nothing_else() -> None:
+def test_a_verdict_names_the_effects_that_show_and_nothing_else() -> None:
     pair = with_set("pair", ["ghost", "core_blur"], [["ghost"]], rival=400.0)
     pair.report.update(verdict="attributed", answer=["ghost"])
     # Of two effects that show, or of which none shows, both are required.

@@ -118,7 +118,7 @@ def test_a_case_that_fails_says_why(tmp_path: Path) -> None:
         assert made.seals() == {}
 
 
-def test_a_truth_of_another_form_is_refused_and_the_kind_follows_from_the_names() -> None:
+def test_a_truth_has_its_form_and_a_kind_by_its_names() -> None:
     ghost = {"name": "ghost"}
     truths: list[tuple[Any, str]] = [
         (None, 'a truth as JSON with "effects"'),

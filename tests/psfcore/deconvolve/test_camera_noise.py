@@ -54,7 +54,7 @@ def test_the_measured_figures_are_those_of_the_camera(gain: float, cards: dict[s
     assert found.as_json()["sigma"] == found.sigma
 
 
-def test_lost_pixels_do_not_count_a_large_image_is_measured_in_parts_and_one_without_noise_is_refused(
+def test_which_pixels_of_an_image_are_measured(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     image = image_of(Noise(1.0, 5.0))

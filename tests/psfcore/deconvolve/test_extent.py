@@ -76,7 +76,7 @@ def test_a_psf_is_read_once_and_a_binned_image_gets_the_psf_of_its_pixels_once(p
     np.testing.assert_array_equal(fitted.kernel, psf_for_image(whole, binned).kernel)
 
 
-def test_engines_are_made_once_and_the_least_recently_used_are_removed_but_never_the_last(
+def test_engines_are_made_once_and_the_oldest_are_removed(
     psf_file: Path,
 ) -> None:
     prepared = PreparedPsfs(2**30)

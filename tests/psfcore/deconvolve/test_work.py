@@ -81,9 +81,7 @@ def test_a_box_alone_differs_from_the_whole_image_by_at_most_its_bound(
         assert np.abs(image.pixels[box.slices] - expected).max() > 2 * result.of_box.error
 
 
-def test_the_bound_holds_before_and_after_convergence_and_at_an_edge_of_the_image(
-    image: Image, psf: Psf
-) -> None:
+def test_the_bound_holds_before_convergence_and_at_an_edge(image: Image, psf: Psf) -> None:
     for method, steps in (
         ("richardson-lucy", 1),
         ("linear", 2),
@@ -153,9 +151,7 @@ def test_the_quality_of_a_box_is_that_of_its_place_in_the_image(image: Image, ps
     assert quality[:, 0].all() and not quality[-1, -1] & QualityBit.EDGE
 
 
-def test_a_box_that_is_no_part_of_the_image_and_what_depends_on_the_whole_image_are_refused(
-    image: Image, psf: Psf
-) -> None:
+def test_what_is_no_part_or_needs_the_whole_image_is_refused(image: Image, psf: Psf) -> None:
     for box in (Box(0, 257, 0, 20), Box(30, 20, 0, 20)):
         with pytest.raises(DataError, match=f"region-outside: .*{box}"):
             box_work(Work(image, psf, Options(method="linear")), box)

@@ -27,9 +27,7 @@ def by_pitch(study: DesignStudy, wire_um: float) -> list[MeshDesign]:
     return [row for row in study.rows if row.wire_um == wire_um]
 
 
-def test_the_flown_mesh_has_the_published_spacing_and_diffracted_share_and_the_study_is_plotted(
-    study: DesignStudy, tmp_path: Path
-) -> None:
+def test_the_flown_mesh_has_the_published_spacing_and_share(study: DesignStudy, tmp_path: Path) -> None:
     flown = study.flown
     assert flown is not None
     assert flown in study.rows

@@ -102,7 +102,7 @@ def test_without_rotation_the_pattern_is_the_product_of_exact_lines() -> None:
         assert found.sum() == pytest.approx(exact.sum(), abs=1e-5), name
 
 
-def test_the_pattern_has_the_symmetries_of_a_square_and_rotation_moves_no_light_to_other_radii() -> None:
+def test_symmetries_of_a_square_and_light_that_stays_at_its_radius() -> None:
     kernel = rotated("hri entrance", 17.0, 129)
     np.testing.assert_allclose(kernel, kernel[::-1, ::-1], atol=1e-12)
     np.testing.assert_allclose(kernel, np.rot90(kernel), atol=1e-12)

@@ -38,7 +38,7 @@ from tests.psfcore.small_transits import (
 )
 
 
-def test_the_true_psf_leaves_no_residual() -> None:
+def test_a_wrong_psf_leaves_the_residual_of_an_exact_inverse() -> None:
     found = judged()
     assert len(found.frames) == IMAGES and not found.left_out
     assert max(abs(f.residual_pct) for f in found.frames) < 0.01
@@ -46,10 +46,7 @@ def test_the_true_psf_leaves_no_residual() -> None:
     assert found.superposed.mape_mean_pct < 0.01
     for n, frame in enumerate(found.frames):
         assert residual_against_pct(frame, sky().noise_free[n]) == pytest.approx(frame.residual_pct, abs=1e-4)
-
-
-def test_a_wrong_psf_leaves_the_residual_of_an_exact_inverse() -> None:
-    """Compared with a double-precision inverse: invert, set the disc to zero, convolve."""
+    # Compared with a double-precision inverse: invert, set the disc to zero, convolve.
     for total, n in ((1.1 * SCATTER.total, 0), (0.0, 5)):
         found = judged(total)
         through = Convolver(kernel_with(total), (SIZE_PX, SIZE_PX), dtype=np.float64)

@@ -40,7 +40,7 @@ def compared() -> ShapesByErrors:
         return compare_shapes_by_errors(solved())
 
 
-def test_all_shapes_are_compared_on_the_same_images_by_the_figures_of_the_evaluation() -> None:
+def test_all_shapes_are_compared_on_the_same_images() -> None:
     found = compared()
     said = json.loads(json.dumps(found.to_json(), allow_nan=False))
     assert said["shapes"][1]["parameters"]["bend"]["sigma"] > 0

@@ -116,7 +116,7 @@ def test_errors_cover_the_true_values(expected: NDArray[np.float64]) -> None:
     assert np.all((width > 0.7) & (width < 1.4)), width
 
 
-def test_arms_are_recovered_from_a_difference_an_inexact_centre_and_with_masked_pixels(
+def test_arms_of_a_difference_and_of_an_inexact_centre(
     expected: NDArray[np.float64],
 ) -> None:
     image, saturated = observed(expected, 5)
@@ -213,7 +213,7 @@ PATTERN = np.array([0.0, np.pi / 2, 10.0])  # two arms, along x and y; orders 10
 GEOMETRY = Geometry((50.0, 50.0), 3.0, (15.0, 40.0))
 
 
-def test_orders_on_unusable_pixels_or_off_the_image_are_left_out_and_few_are_refused() -> None:
+def test_orders_on_unusable_pixels_are_left_out_and_few_refused() -> None:
     usable = np.ones((85, 101), dtype=bool)  # the order at y = 90 is off the image
     usable[45:56, 66:75] = False  # around the order at x = 70
     arm, k = orders_between(PATTERN, GEOMETRY.radii_px)

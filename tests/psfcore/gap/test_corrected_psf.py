@@ -113,7 +113,7 @@ def test_a_core_blur_is_in_the_kernel_with_its_own_value() -> None:
     assert psf.kernel.sum() == pytest.approx(plain.sum(), rel=1e-12)
 
 
-def test_effects_of_the_optics_are_in_the_kernel_at_their_place_and_along_their_direction() -> None:
+def test_effects_of_the_optics_are_in_the_kernel_at_their_place() -> None:
     """To first order it is the true stretched PSF: p is ln(1 + stretch) along x."""
     stretch, plain = 0.02, fitted_kernel()
     psf = corrected(effect("anisotropic_scatter"), values=(float(np.log1p(stretch)), 0.0))

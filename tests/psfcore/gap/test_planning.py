@@ -77,7 +77,7 @@ def test_a_plan_as_json() -> None:
     assert content["searched"] == ["wide_halo"]
 
 
-def test_text_and_page_name_every_effect_and_pair_and_what_would_not_be_found() -> None:
+def test_text_and_page_name_every_effect_and_pair() -> None:
     plan = planned(ONE)
     html = plan_page(plan)
     check_stands_alone(html)

@@ -59,9 +59,6 @@ def test_the_error_names_the_telescope_the_reason_and_the_step() -> None:
             assert sentence in [one.get("known") for one in error.fields["ways"]]
         for recommended in list(telescope.ways.values())[:1]:
             assert recommended in error.message
-
-
-def test_other_telescopes_are_not_taken_for_these() -> None:
     for cards in OTHERS:
         seen = seen_by(Header(cards))
         assert telescope_without_file(seen) is None, cards

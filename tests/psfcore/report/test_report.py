@@ -103,7 +103,7 @@ def test_each_image_is_evaluated_with_the_psf_of_the_fold_that_holds_it_out() ->
     assert any(abs(got[f.file] - f.residual_pct) > 1e-3 for f in within.frames), "not held out"
 
 
-def test_the_json_holds_the_numbers_of_the_page_and_progress_covers_all_stages() -> None:
+def test_the_json_holds_the_numbers_and_progress_covers_all_stages() -> None:
     found = whole_json()
     assert found["schema"] == "psf-report/1" and found["sentence"] == whole().sentence
     assert [o["offset_dn"] for o in found["evaluation"]["dark_offsets"]["offsets"]] == [-5.0, -3.0, 3.0, 5.0]

@@ -60,7 +60,7 @@ def test_without_noise_the_curve_is_the_true_one() -> None:
     assert found.chi2_per_pixel < 1e-4
 
 
-def test_with_noise_it_is_the_true_one_within_its_errors_near_the_photon_bound() -> None:
+def test_with_noise_it_is_true_within_errors_near_the_photon_bound() -> None:
     found = solved().inversion
     pull = off(found) / found.curve_sigma
     assert np.abs(pull).max() < 4
@@ -243,7 +243,7 @@ def frame_with(filled: NDArray[np.bool_] | None = None) -> Frame:
     return Frame("a", np.ones((60, 70), np.float32), 1, Place(30, 30, 10.75), 1.0, 0.0, filled=filled)
 
 
-def test_dark_pixels_are_certainly_dark_and_fewer_if_their_position_is_uncertain() -> None:
+def test_dark_pixels_are_certainly_dark() -> None:
     rows, columns = dark_pixels(frame_with(), found_at(40.2, 29.7))
     sure = np.zeros((60, 70), bool)
     sure[rows, columns] = True

@@ -19,7 +19,7 @@ from tests.psfcore.small_transits import DIFFRACTION, SCATTER
 AT = SOFTENED_POWER_LAW.coordinates({"b_px": 6.15, "c": 2.53, "total": 0.411})
 
 
-def test_scatter_and_diffraction_convolve_also_where_the_pattern_is_larger_than_the_square() -> None:
+def test_scatter_and_diffraction_convolve_for_any_size() -> None:
     """The square agrees with the full reach, except for light that is diffracted back from outside it."""
     total = TotalPsf(DIFFRACTION, SOFTENED_POWER_LAW, (100, 131))
     assert total.size == 262

@@ -118,7 +118,7 @@ def test_what_cannot_be_summed_is_refused_and_nothing_gives_nothing() -> None:
     np.testing.assert_array_equal(segment_sums(image, np.array([[3, 4]]), far), [[0.0]])
 
 
-def test_published_shells_are_ten_five_and_thirty_five_and_hold_the_light_of_the_full_reach() -> None:
+def test_published_shells_hold_the_light_of_the_full_reach() -> None:
     edges = shells_as_published()
     assert len(edges) == 51 and (edges[10], edges[15]) == (5.0, 10.0)
     widths = np.diff(edges[15:])

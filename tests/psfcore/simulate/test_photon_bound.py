@@ -172,9 +172,7 @@ def test_errors_of_places_agree_with_whole_simulations(
         assert bound.places_px[index] == pytest.approx(expected, rel=2e-5)
 
 
-def test_four_times_the_light_halves_the_errors_and_clipped_pixels_are_not_used(
-    bound: PhotonBound, sky: TrueSky
-) -> None:
+def test_four_times_the_light_halves_the_errors_without_clipping(bound: PhotonBound, sky: TrueSky) -> None:
     photons_only = dataclasses.replace(sky.plan, noise=Noise(6.0, 0.0))
     longer = tuple(dataclasses.replace(shot, exposure_s=4 * shot.exposure_s) for shot in sky.plan.shots)
     once = bound_of_sky(dataclasses.replace(sky, plan=photons_only))
@@ -193,7 +191,7 @@ def test_four_times_the_light_halves_the_errors_and_clipped_pixels_are_not_used(
     assert found.places_px[0] == pytest.approx(bound.places_px[0])  # combined gain does not clip
 
 
-def test_the_bound_of_a_folder_is_that_of_its_transit_and_without_scatter_there_is_none(
+def test_the_bound_of_a_folder_is_that_of_its_transit(
     tmp_path: Path,
 ) -> None:
     simulated = simulate(default_plan(3, 64), dataclasses.replace(SCATTER, stretch=0.1), DIFFRACTION, 2)

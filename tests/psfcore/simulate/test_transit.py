@@ -208,7 +208,7 @@ def test_half_pixels_are_binned_after_the_disc_is_removed() -> None:
 # --- noise, ephemeris, camera -----------------------------------------------------------------------------
 
 
-def test_noise_has_the_variance_of_photon_and_read_noise() -> None:
+def test_noise_has_the_variance_of_photon_and_read_noise_and_repeats_its_seed() -> None:
     plan = default_plan(6, 64, whole_dn=False)
     sky = flat_sky(plan, 60.0)
     pulls: dict[int, list[NDArray[np.float64]]] = {index: [] for index in range(6)}
@@ -224,9 +224,6 @@ def test_noise_has_the_variance_of_photon_and_read_noise() -> None:
         assert abs(np.corrcoef(stacked.reshape(12, -1))[0, 1:]).max() < 0.08  # no seed repeats another's
     frames = np.corrcoef([np.concatenate(pulls[index]).ravel() for index in range(6)])
     assert abs(frames - np.eye(6)).max() < 0.03  # nor an image another's
-
-
-def test_one_observation_without_noise_is_the_blurred_scene_and_with_noise_repeats_its_seed() -> None:
     scene, quiet = solar_scene((48, 48), 2), {"photon_gain_dn": 0.0, "read_noise_dn": 0.0, "seed": 1}
     seen = observe(scene, make_psf(delta(16)), exposure_s=2.0, **quiet)
     np.testing.assert_allclose(seen, scene, rtol=1e-12)
@@ -241,7 +238,7 @@ def test_one_observation_without_noise_is_the_blurred_scene_and_with_noise_repea
     np.testing.assert_array_equal(seen, Noise(6.0, 2.0).observe(flat, 1.4, np.random.default_rng(3)))
 
 
-def test_images_are_whole_dn_saturate_at_high_gain_and_have_the_dark_offset(small: SimulatedTransit) -> None:
+def test_images_are_whole_dn_with_saturation_and_dark_offset(small: SimulatedTransit) -> None:
     for frame in small.transit.frames:
         dn = frame.pixels.astype(np.float64) * frame.exposure_s
         np.testing.assert_allclose(dn, np.rint(dn), atol=1e-3)
@@ -303,7 +300,7 @@ def test_the_limb_is_on_the_side_of_the_pointing() -> None:
     assert abs(np.corrcoef(east.ravel(), west[:, ::-1].ravel())[0, 1]) < 0.999  # not the same limb
 
 
-def test_a_scene_is_positive_with_the_contrasts_of_the_sun_and_follows_from_its_seed() -> None:
+def test_a_scene_has_the_contrasts_of_the_sun_and_its_seed() -> None:
     """The numbers are those of the first version: a seed names the same scene for ever."""
     for shape, mean, brightest in (
         ((64, 64), 1806.6784176258332, 57303.802124101276),

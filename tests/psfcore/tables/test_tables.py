@@ -94,9 +94,6 @@ def test_the_stated_interpolation_error_covers_the_true_one() -> None:
     assert f"{100 * said:.2f} points" in psf_lookup.curve(tables)["resolution"]
     smooth = tables_of(make_psf(scattering()))
     assert smooth["interpolation_error"]["TOTAL"] < 1e-3
-
-
-def test_an_array_beyond_the_full_reach_has_no_negative_light_beyond() -> None:
     kernel = np.pad(gaussian(2048, 3.0), 50)
     kernel[0, 0] = 5e-4  # farther than 1448 px
     said = psf_lookup.curve(tables_of(make_psf(kernel)))["light_beyond_pct"]["TOTAL"]
@@ -156,9 +153,6 @@ def test_two_psfs_are_compared_at_their_common_radii() -> None:
     assert found["difference_of_sums"] == pytest.approx(less.sum() - scattering().sum())
     assert found["difference_of_central_weights"] > 0
     assert psf_lookup.compare(one, one)["largest_points"]["TOTAL"] == 0
-
-
-def test_bad_questions_are_refused() -> None:
     tables = tables_of(make_psf(scattering(), plate_scale_arcsec=0.5))
     other = tables_of(make_psf(scattering(), plate_scale_arcsec=0.6))
     cases = [

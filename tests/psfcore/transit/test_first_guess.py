@@ -69,7 +69,7 @@ def two_pointings() -> Transit:
     )
 
 
-def test_for_a_homogeneous_sun_it_is_the_light_beyond_the_radius_without_filled_pixels(
+def test_for_a_homogeneous_sun_it_is_the_light_beyond_the_radius(
     two_pointings: Transit,
 ) -> None:
     guess = first_guess(two_pointings)

@@ -104,7 +104,7 @@ def test_frames_are_sorted_by_time_or_without_dates_by_the_manifest(folder: Path
     assert [frame.time_s for frame in read_transit(folder, LIMITS).frames] == [0.0] * 6
 
 
-def test_given_noise_replaces_that_of_the_manifest_and_headers_tell_the_instrument(folder: Path) -> None:
+def test_noise_and_instrument_come_from_call_manifest_or_headers(folder: Path) -> None:
     assert read_transit(folder, LIMITS, noise=Noise(1.0, 0.5)).noise == Noise(1.0, 0.5)
     write_transit(folder, noise=None)
     assert read_transit(folder, LIMITS, noise=Noise(1.0, 0.5)).noise == Noise(1.0, 0.5)

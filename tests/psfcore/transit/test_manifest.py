@@ -34,7 +34,7 @@ def changed(change: Change) -> bytes:
     return json.dumps(content).encode()
 
 
-def test_a_manifest_is_read_as_written_without_optional_and_with_unknown_keys() -> None:
+def test_a_manifest_is_read_as_written_with_unknown_keys() -> None:
     manifest = parse_manifest(json.dumps(GOOD).encode())
     assert manifest.instrument == "hri_euv"
     assert manifest.noise is not None and manifest.noise.read_noise_dn == 2.0

@@ -46,7 +46,7 @@ PLACES = [Place(20.0, 20.0, RADIUS_PX), Place(20.3, 18.77, RADIUS_PX), Place(19.
 # --- the disc ---------------------------------------------------------------------------------------------
 
 
-def test_the_covered_area_is_that_of_the_disc_and_dark_pixels_have_all_corners_in_it() -> None:
+def test_covered_area_and_dark_pixels_are_those_of_the_disc() -> None:
     for place in PLACES:
         share = coverage((41, 40), place)
         assert share.sum() == pytest.approx(np.pi * place.radius_px**2, rel=1e-3)
@@ -172,9 +172,7 @@ def displaced(transit: Transit, index: int, place: Place) -> Transit:
     return dataclasses.replace(transit, frames=tuple(frames))
 
 
-def test_an_ephemeris_wrong_by_pixels_is_corrected_a_larger_error_reported_and_a_disc_off_the_frame_refused() -> (
-    None
-):
+def test_a_wrong_ephemeris_is_corrected_reported_or_refused() -> None:
     of = sky(brightness=BRIGHT)
     exact = of.plan.place(5)
     near = Place(exact.x_px + 2.5, exact.y_px - 3.0, RADIUS_PX)

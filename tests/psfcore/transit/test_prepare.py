@@ -73,7 +73,7 @@ def test_filled_pixels_are_scaled_to_the_brightness_of_the_frame() -> None:
     assert (counts.saturated, counts.from_frames, counts.from_neighbours, counts.unfilled) == (48, 48, 0, 0)
 
 
-def test_gaps_are_filled_from_the_nearest_frame_of_the_same_pointing_and_then_from_the_next() -> None:
+def test_gaps_are_filled_from_the_nearest_frames_of_the_pointing() -> None:
     rate, marked = true_rate(1), [true_rate(1) for _ in range(4)]
     for number, frame in enumerate(marked):
         frame[SPOT] = 2000.0 + number
@@ -102,7 +102,7 @@ def test_gaps_are_filled_from_the_nearest_frame_of_the_same_pointing_and_then_fr
     assert prepared.frames[0].from_frames == 48 and prepared.frames[1].from_frames == 24
 
 
-def test_pixels_behind_another_occulter_are_not_used_and_those_that_no_frame_shows_keep_their_value() -> None:
+def test_pixels_that_no_frame_shows_keep_their_value() -> None:
     rate = true_rate(1)
     over_the_spot = exposure(rate, time_s=10, place=Place(63.5, 42.5, 4.0))
     over_the_spot.pixels[SPOT] = 1.0
@@ -116,7 +116,7 @@ def test_pixels_behind_another_occulter_are_not_used_and_those_that_no_frame_sho
     assert prepared.unfilled == 96 and prepared.to_json()["frames"][0]["unfilled"] == 48
 
 
-def test_nan_is_filled_from_frames_and_else_from_neighbours_and_stays_dark_on_the_occulter() -> None:
+def test_nan_is_filled_from_frames_and_else_from_neighbours() -> None:
     rate = np.full(SHAPE, 80.0)
     rate[:, 40:] = 120.0
     gap = (slice(30, 32), slice(20, 22))

@@ -23,7 +23,7 @@ from tests.psfcore.gap.linear_models import (
 )
 
 
-def test_a_fit_finds_values_errors_and_units_and_parameters_of_several_effects_have_their_names(
+def test_a_fit_finds_values_errors_units_and_names(
     evidence: Evidence,
 ) -> None:
     model = with_residuals(evidence, {"dark_offset": 3.0})

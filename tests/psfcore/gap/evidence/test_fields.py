@@ -139,7 +139,7 @@ def test_a_field_takes_the_place_of_the_effect_with_its_name(evidence: Evidence)
     assert [effect.name for effect in other.effects] == [*names, *UNKNOWN]
 
 
-def test_a_change_of_the_psf_spares_images_without_a_disc_and_data_have_only_the_fields_that_they_can_show(
+def test_data_have_only_the_fields_that_they_can_show(
     evidence: Evidence,
 ) -> None:
     lost = evidence.discs[0].index

@@ -223,7 +223,7 @@ def test_the_curvature_is_that_of_the_scatter_kernel() -> None:
         assert max(bent for _, bent in curvatures) < likelihoods.MOST_CURVATURE, law
 
 
-def test_a_long_step_of_the_psf_is_not_linear_and_a_misfit_of_every_hypothesis_decides_less(
+def test_what_a_long_step_and_a_misfit_of_all_hypotheses_change(
     evidence: Evidence,
 ) -> None:
     """The curvature of the PSF grows with the fourth power of the step: with its relative error and its change. A very long step

@@ -50,7 +50,7 @@ def test_the_effects_of_a_file_follow_the_library_and_have_its_hash(tmp_path: Pa
     assert by_place[-1][1] > 3 * abs(by_place[0][1])
 
 
-def test_a_module_also_works_a_changed_file_is_reloaded_and_the_examples_of_the_documentation_work(
+def test_modules_changed_files_and_the_examples_of_the_documentation(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = "from __future__ import annotations\nfrom dataclasses import dataclass, KW_ONLY\n"
@@ -92,7 +92,7 @@ def test_an_error_in_a_source_is_reported_with_its_name(tmp_path: Path) -> None:
             added_effects([source])
         assert refusal.value.code == "bad-effects"
         assert said in refusal.value.message and source in refusal.value.message, text
-    for source in ("nowhere.py", "no_such.module", "sys", "..relative", ""):
+    for source in ("nowhere.py", "no_such_module", "no_such.module", "sys", "..relative", ""):
         with pytest.raises(DataError, match=f"effects of {source}") as refusal:
             added_effects([source])
         assert refusal.value.code == "bad-effects"

@@ -158,7 +158,7 @@ def test_every_verdict_is_explained_on_its_page(verdict: str, blank: None) -> No
     assert said[name] == (", ".join(diagnosis.judgement.answer).replace("_", " ") or "none")
 
 
-def test_fields_without_a_map_held_out_images_and_alike_effects_are_told_in_words(blank: None) -> None:
+def test_what_has_no_picture_is_told_in_words(blank: None) -> None:
     diagnosis = judged("unknown")
     report = report_of(diagnosis)
     drawn = "The most probable field of an unknown cause"

@@ -112,7 +112,7 @@ def test_the_report_of_every_verdict(verdict: str) -> None:
     assert ("It varies most " in sentence) is (verdict not in ("none", "inconclusive"))
 
 
-def test_limits_alike_and_calibration_are_stated_and_hardly_possible_hypotheses_are_not() -> None:
+def test_limits_alike_calibration_and_possible_hypotheses_are_stated() -> None:
     pair = Alike(OFFSET_BLUR, 1.4, "a series of exposure times")
     attributed = judged("attributed")
     report = gap_report(replace(attributed, limits=replace(attributed.limits, alike=(pair,))))

@@ -69,7 +69,7 @@ def of_images(chi2: float, expected: float, blocks: float = 0.0, residual_pct: f
     )
 
 
-def test_closure_gap_and_fall_by_hand_and_the_interval_of_closure_contains_its_known_errors() -> None:
+def test_closure_its_interval_gap_and_fall_by_hand() -> None:
     rng = np.random.default_rng(1)
     before, after = of_images(110.0, 10.0, residual_pct=5.0), of_images(20.0, 10.0, residual_pct=1.0)
     found = closure(before, after, rng)

@@ -108,9 +108,7 @@ def test_the_excluded_strength_is_a_quantile_of_the_fitted_one(model: LinearMode
         assert excluded == pytest.approx(value + norm.ppf(0.95) * sigma, abs=0.6 * sigma), name
 
 
-def test_the_found_strength_of_one_parameter_is_that_of_a_noncentral_chi2_and_a_stricter_answer_needs_more(
-    model: LinearModel, limits_of: Of
-) -> None:
+def test_the_found_strength_is_that_of_a_noncentral_chi2(model: LinearModel, limits_of: Of) -> None:
     """With one effect in the library, and against "no effect" alone, the strength follows from one noncentral chi2 variable."""
     (column,), base = model.evidence.columns["dark_offset"], list(model.evidence.base)
     offset = effect_of(model.evidence, "dark_offset")
