@@ -50,7 +50,7 @@ def a_map(data: np.ndarray | None = None, **more: Any) -> Any:
     return sunpy.map.Map(pixels() if data is None else data, cards(**more))
 
 
-def test_a_map_comes_back_as_a_map_with_its_metadata(psf: heliopsf.Psf) -> None:
+def test_a_map_comes_back_as_a_map_that_is_a_product(psf: heliopsf.Psf, tmp_path: Path) -> None:
     image = a_map(history="calibrated\nflat-fielded", datamin=1.0, datarms=3.0)
     before = dict(image.meta)
     result = heliopsf.deconvolve(image, psf, iterations=5)
@@ -65,9 +65,6 @@ def test_a_map_comes_back_as_a_map_with_its_metadata(psf: heliopsf.Psf) -> None:
     assert lines[:2] == ["calibrated", "flat-fielded"]
     assert "richardson-lucy, 5 steps" in lines[2] and psf.version in lines[2]
     assert result.mask is None and result.uncertainty is None
-
-
-def test_a_saved_map_is_a_product_with_the_same_cards(psf: heliopsf.Psf, tmp_path: Path) -> None:
     result = heliopsf.deconvolve(a_map(), psf)
     result.save(tmp_path / "product.fits")
     assert fits.getheader(tmp_path / "product.fits")["PSFID"] == psf.provenance["psf_id"]
@@ -145,7 +142,7 @@ def test_a_cube_of_two_axes_stays_a_cube_with_its_coordinates(psf: heliopsf.Psf)
         heliopsf.deconvolve(Cube(np.ones((3, *SHAPE)), three, unit=u.DN), psf)
 
 
-def test_pixels_without_a_value_stay_without_one_and_are_masked(psf: heliopsf.Psf) -> None:
+def test_pixels_without_a_value_and_masked_arrays_stay_masked(psf: heliopsf.Psf) -> None:
     data = pixels()
     data[10, 20] = np.nan
     mask = np.zeros(SHAPE, bool)
@@ -157,6 +154,21 @@ def test_pixels_without_a_value_stay_without_one_and_are_masked(psf: heliopsf.Ps
     np.testing.assert_array_equal(result.mask, wanted)
     full = heliopsf.deconvolve(image, psf, full=True)
     np.testing.assert_array_equal((full.quality & QualityBit.NONFINITE) != 0, wanted)
+    hidden = np.zeros(SHAPE, bool)
+    hidden[30, 40] = True
+    wanted = heliopsf.deconvolve(sunpy.map.Map(pixels(), cards(), mask=hidden), psf)
+    for image in (
+        np.ma.MaskedArray(pixels(), hidden),
+        Masked(pixels() * u.DN, hidden),
+        Masked(pixels(), hidden),
+    ):
+        result = heliopsf.deconvolve(image, psf)
+        assert type(result) is type(image)
+        np.testing.assert_array_equal(result.mask, hidden)
+        found = np.asarray(getattr(result, "unmasked", result))
+        np.testing.assert_array_equal(found[~hidden], wanted.data[~hidden])
+    unhidden = sunpy.map.Map(pixels(), cards(), mask=np.zeros(SHAPE, bool))
+    assert not heliopsf.deconvolve(unhidden, psf).mask.any()
 
 
 def test_an_uncertainty_is_added_where_asked(psf: heliopsf.Psf) -> None:
@@ -231,24 +243,6 @@ def test_an_hdu_gives_an_hdu_and_a_list_of_hdus_the_planes_of_a_product(psf: hel
         heliopsf.deconvolve(fits.HDUList([fits.PrimaryHDU()]), psf)
 
 
-def test_masked_arrays_stay_masked(psf: heliopsf.Psf) -> None:
-    hidden = np.zeros(SHAPE, bool)
-    hidden[30, 40] = True
-    wanted = heliopsf.deconvolve(sunpy.map.Map(pixels(), cards(), mask=hidden), psf)
-    for image in (
-        np.ma.MaskedArray(pixels(), hidden),
-        Masked(pixels() * u.DN, hidden),
-        Masked(pixels(), hidden),
-    ):
-        result = heliopsf.deconvolve(image, psf)
-        assert type(result) is type(image)
-        np.testing.assert_array_equal(result.mask, hidden)
-        found = np.asarray(getattr(result, "unmasked", result))
-        np.testing.assert_array_equal(found[~hidden], wanted.data[~hidden])
-    unhidden = sunpy.map.Map(pixels(), cards(), mask=np.zeros(SHAPE, bool))
-    assert not heliopsf.deconvolve(unhidden, psf).mask.any()
-
-
 def test_an_uncertainty_is_the_noise_and_comes_back(psf: heliopsf.Psf) -> None:
     sigma = np.sqrt(2.0 * pixels() + 1.0)
     given = heliopsf.deconvolve(
@@ -284,7 +278,7 @@ def test_a_list_gives_a_list_a_sequence_a_sequence_and_an_error_names_the_image(
         heliopsf.deconvolve([a_map(), a_map(wavelnth=304)], psf)
 
 
-def test_what_is_no_image_is_refused(psf: heliopsf.Psf) -> None:
+def test_what_is_no_image_or_region_is_refused(psf: heliopsf.Psf) -> None:
     for image, code in (
         (None, "bad-input"),
         ({"a": 1}, "bad-input"),
@@ -296,6 +290,20 @@ def test_what_is_no_image_is_refused(psf: heliopsf.Psf) -> None:
     ):
         with pytest.raises(DataError, match=code):
             heliopsf.deconvolve(image, psf)
+    regions: list[tuple[Any, str]] = [
+        ("1:2", "bad-region"),
+        ((1, 2), "bad-region"),
+        (np.s_[0:40:2, 0:40], "bad-region"),
+        (np.s_[0:40], "bad-region"),
+        ("0:20,80:97", "region-outside"),
+        (np.s_[0:10, 0:40], "region-too-small"),
+    ]
+    for region, code in regions:
+        for image in (pixels(), a_map()):
+            with pytest.raises(DataError, match=code):
+                heliopsf.deconvolve(image, psf, region=region)
+    with pytest.raises(DataError, match="region-errors"):
+        heliopsf.deconvolve(pixels(), psf, region=REGION, error_draws=4, noise=(1.0, 1.0))
 
 
 def test_a_psf_may_be_an_object_a_file_or_weights(psf: heliopsf.Psf, tmp_path: Path) -> None:
@@ -312,7 +320,7 @@ def test_a_psf_may_be_an_object_a_file_or_weights(psf: heliopsf.Psf, tmp_path: P
         heliopsf.deconvolve(a_map(), {"psf": 1})  # type: ignore[call-overload]
 
 
-def test_calls_of_aiapy_work_unchanged(psf: heliopsf.Psf) -> None:
+def test_calls_of_aiapy_work_unchanged(psf: heliopsf.Psf, capsys: pytest.CaptureFixture[str]) -> None:
     """Names and order of ``aiapy.psf.deconvolve`` (0.10): smap, psf, iterations, clip_negative, use_gpu."""
     names = list(inspect.signature(heliopsf.deconvolve).parameters)
     assert names[:5] == ["smap", "psf", "iterations", "clip_negative", "use_gpu"]
@@ -328,9 +336,6 @@ def test_calls_of_aiapy_work_unchanged(psf: heliopsf.Psf) -> None:
     assert kept.data[0, 0] < clipped.data[0, 0]
     with pytest.raises(DataError, match="got both"):
         heliopsf.deconvolve(a_map(), psf, iterations=5, steps=5)
-
-
-def test_progress_is_told_on_the_terminal(psf: heliopsf.Psf, capsys: pytest.CaptureFixture[str]) -> None:
     heliopsf.deconvolve(a_map(), psf, iterations=3, progress=True)
     assert "deconvolving: step 3 of 3\n" in capsys.readouterr().err
 
@@ -338,7 +343,7 @@ def test_progress_is_told_on_the_terminal(psf: heliopsf.Psf, capsys: pytest.Capt
 REGION = "32:64,24:56"  # x and y differ
 
 
-def test_a_region_of_a_map_is_its_submap_deconvolved(psf: heliopsf.Psf) -> None:
+def test_a_region_is_its_submap_in_the_form_of_its_image(psf: heliopsf.Psf, tmp_path: Path) -> None:
     image = a_map(datarms=3.0)
     part = image.submap([32, 24] * u.pix, top_right=[63, 55] * u.pix)
     whole = heliopsf.deconvolve(image, psf)
@@ -352,9 +357,6 @@ def test_a_region_of_a_map_is_its_submap_deconvolved(psf: heliopsf.Psf) -> None:
         assert 0 < result.meta["dcnvberr"] < 0.9 * part.data.mean()
         difference = np.abs(result.data - whole.data[24:56, 32:64])
         assert difference.max() <= result.meta["dcnvberr"]
-
-
-def test_a_region_has_the_form_of_its_image(psf: heliopsf.Psf, tmp_path: Path) -> None:
     a_map().save(tmp_path / "image.fits")
     options: dict[str, Any] = {"region": REGION, "region_error": 0.9, "other_channel": True}
     wanted = heliopsf.deconvolve(tmp_path / "image.fits", psf, **options)
@@ -373,23 +375,6 @@ def test_a_region_has_the_form_of_its_image(psf: heliopsf.Psf, tmp_path: Path) -
     assert [one.shape for one in several] == [(32, 32), (32, 32)]
 
 
-def test_a_region_that_cannot_be_used_is_refused(psf: heliopsf.Psf) -> None:
-    regions: list[tuple[Any, str]] = [
-        ("1:2", "bad-region"),
-        ((1, 2), "bad-region"),
-        (np.s_[0:40:2, 0:40], "bad-region"),
-        (np.s_[0:40], "bad-region"),
-        ("0:20,80:97", "region-outside"),
-        (np.s_[0:10, 0:40], "region-too-small"),
-    ]
-    for region, code in regions:
-        for image in (pixels(), a_map()):
-            with pytest.raises(DataError, match=code):
-                heliopsf.deconvolve(image, psf, region=region)
-    with pytest.raises(DataError, match="region-errors"):
-        heliopsf.deconvolve(pixels(), psf, region=REGION, error_draws=4, noise=(1.0, 1.0))
-
-
 def test_an_image_that_does_not_fit_into_the_memory_is_refused_before_it_is_read(
     psf: heliopsf.Psf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -403,41 +388,15 @@ def test_an_image_that_does_not_fit_into_the_memory_is_refused_before_it_is_read
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize(
-    ("name", "instrument", "kept"),
-    [
+def test_an_image_of_a_known_telescope_needs_no_option(shared: Path) -> None:
+    """The sum of all pixels changes little; a cut-out exchanges light with the Sun beyond its edges."""
+    for name, instrument, changed in (
         ("eui/derived_hrieuv174_20220401T103005920_pseudolinear.fits", "hri_euv", 0.01),
         ("aia/aia_171_cutout_20130310.fits", "aia_171", 0.03),
-    ],
-)
-def test_an_image_of_a_known_telescope_needs_no_option(
-    shared: Path, name: str, instrument: str, kept: float
-) -> None:
-    """kept: relative change of the sum of all pixels; a cut-out exchanges light with the Sun beyond its edges."""
-    image = sunpy.map.Map(shared / "data" / "real" / name)
-    sharp = heliopsf.deconvolve(image)
-    assert type(sharp) is type(image) and sharp.meta["psfname"] == instrument
-    assert sharp.wcs.wcs.compare(image.wcs.wcs)
-    assert sharp.data.sum() == pytest.approx(image.data.sum(), rel=kept)
-    assert np.percentile(sharp.data, 99) > np.percentile(image.data, 99)
-
-
-@pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize(
-    "name",
-    [
-        "occultation/L1_XRT20120605_215839.9.fits",
-        pytest.param("other/swap_lv1_20110607_063329.fits.gz", marks=pytest.mark.slow),
-        pytest.param("eui/solo_L2_eui-fsi174-image_20240109T200055237_V01.fits", marks=pytest.mark.slow),
-    ],
-)
-def test_an_image_goes_in_and_out_with_a_given_psf(shared: Path, name: str) -> None:
-    image = sunpy.map.Map(shared / "data" / "real" / name)
-    weights = np.zeros((65, 65))
-    weights[31:34, 31:34] = 0.02
-    weights[32, 32] = 1 - 8 * 0.02
-    sharp = heliopsf.deconvolve(image, weights, iterations=3)
-    assert type(sharp) is type(image) and sharp.data.shape == image.data.shape
-    assert sharp.wcs.wcs.compare(image.wcs.wcs) and sharp.meta["dcnviter"] == 3
-    with pytest.raises(heliopsf.DataError, match="already-deconvolved"):
-        heliopsf.deconvolve(sharp, weights)
+    ):
+        image = sunpy.map.Map(shared / "data" / "real" / name)
+        sharp = heliopsf.deconvolve(image)
+        assert type(sharp) is type(image) and sharp.meta["psfname"] == instrument
+        assert sharp.wcs.wcs.compare(image.wcs.wcs)
+        assert sharp.data.sum() == pytest.approx(image.data.sum(), rel=changed)
+        assert np.percentile(sharp.data, 99) > np.percentile(image.data, 99)

@@ -97,7 +97,16 @@ def test_an_image_is_deconvolved_as_the_core_does(tmp_path: Path) -> None:
     assert steps[-1] == (3, 3) and result.steps_done == 3
 
 
-def test_another_channel_is_refused_and_what_is_not_sure_is_a_warning(tmp_path: Path) -> None:
+def test_errors_have_a_code_and_what_is_not_sure_is_a_warning(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "text.fits").write_text("no FITS" * 1000)
+    with pytest.raises(heliopsf.DataError, match="not-fits"):
+        heliopsf.read_psf(tmp_path / "text.fits")
+    with pytest.raises(heliopsf.ServiceError):
+        heliopsf.Client("http://127.0.0.1:1").health()
+    with pytest.raises(heliopsf.DataError, match=r"known_psf.*hri_euv.*got my-telescope"):
+        known_diffraction("my-telescope")
     write_image(tmp_path / "image.fits", WAVELNTH=193)
     write_psf(tmp_path / "psf.fits")
     paths = (tmp_path / "image.fits", tmp_path / "psf.fits")
@@ -108,16 +117,6 @@ def test_another_channel_is_refused_and_what_is_not_sure_is_a_warning(tmp_path: 
         heliopsf.deconvolve(*paths, steps=1)
     with pytest.warns(UserWarning, match="193 angstrom"):
         heliopsf.deconvolve(*paths, steps=1, other_channel=True)
-
-
-def test_errors_have_a_code(tmp_path: Path) -> None:
-    (tmp_path / "text.fits").write_text("no FITS" * 1000)
-    with pytest.raises(heliopsf.DataError, match="not-fits"):
-        heliopsf.read_psf(tmp_path / "text.fits")
-    with pytest.raises(heliopsf.ServiceError):
-        heliopsf.Client("http://127.0.0.1:1").health()
-    with pytest.raises(heliopsf.DataError, match=r"known_psf.*hri_euv.*got my-telescope"):
-        known_diffraction("my-telescope")
 
 
 def test_a_transit_is_fitted_and_the_fit_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -168,7 +167,7 @@ def _no_windows() -> Iterator[None]:
     pyplot.close("all")
 
 
-def test_a_psf_is_drawn_on_given_or_new_axes(psf: heliopsf.Psf, tmp_path: Path) -> None:
+def test_a_psf_and_a_deconvolution_are_drawn(psf: heliopsf.Psf, tmp_path: Path) -> None:
     left, right = Figure().subplots(1, 2)
     assert psf.plot(left, size=33) is left and psf.plot_curve(right) is right
     np.testing.assert_array_equal(left.images[0].get_array(), psf.kernel[16:49, 16:49])
@@ -178,9 +177,6 @@ def test_a_psf_is_drawn_on_given_or_new_axes(psf: heliopsf.Psf, tmp_path: Path) 
     assert psf.version in psf.plot_curve().get_title()
     psf.quicklook().savefig(tmp_path / "psf.png")
     assert (tmp_path / "psf.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_a_deconvolution_is_drawn(psf: heliopsf.Psf, tmp_path: Path) -> None:
     write_image(tmp_path / "image.fits", WAVELNTH=171, CDELT1=2.0, CDELT2=2.0)
     result = heliopsf.deconvolve(tmp_path / "image.fits", psf)
     before, after = Figure().subplots(1, 2)
@@ -195,7 +191,7 @@ def test_a_deconvolution_is_drawn(psf: heliopsf.Psf, tmp_path: Path) -> None:
 TIMES = {"before_time": "2022-03-01", "after_time": "2023-03-01T00:00:00Z"}
 
 
-def test_files_and_psfs_give_the_same_psf(tmp_path: Path) -> None:
+def test_files_and_psfs_give_the_same_psf_between_two_times(tmp_path: Path) -> None:
     files = [write_fitted(tmp_path / f"{name}.fits", values) for name, values in (("a", EARLY), ("b", LATE))]
     psf = heliopsf.interpolate_psf(*files, **TIMES, time="2022-08-30T12:00:00")
     assert psf.fitted is not None and psf.name == "hri_euv-interpolated"
@@ -206,9 +202,6 @@ def test_files_and_psfs_give_the_same_psf(tmp_path: Path) -> None:
     np.testing.assert_array_equal(psf.kernel, same.kernel)
     psf.write(tmp_path / "between.fits")
     assert heliopsf.read_psf(tmp_path / "between.fits").fitted == psf.fitted
-
-
-def test_wrong_times_and_shapes_are_refused() -> None:
     given = {"before": fitted_psf(EARLY), "after": fitted_psf(LATE), **TIMES, "time": "2022-06-01"}
     wrong: list[tuple[dict[str, Any], str]] = [
         ({"time": "soon"}, "bad-time"),

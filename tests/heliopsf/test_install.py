@@ -155,24 +155,6 @@ def test_the_wheel_holds_the_packages_and_their_files_and_stays_small(wheel: Pat
     assert wheel.stat().st_size < 1.6e6
 
 
-@pytest.mark.slow
-def test_an_empty_environment_runs_the_three_lines(wheel: Path, tmp_path: Path) -> None:
-    python = tmp_path / "empty" / "bin" / "python"
-    subprocess.run([sys.executable, "-m", "venv", str(tmp_path / "empty")], check=True)
-    pip = [str(python), "-m", "pip", "install", "-q", "-c", str(REPOSITORY / "constraints.txt"), str(wheel)]
-    installed = subprocess.run(pip, capture_output=True, text=True)
-    if installed.returncode:
-        pytest.skip(f"the packages cannot be installed here: {installed.stderr[-300:]}")
-    listed = subprocess.run(
-        [str(python), "-m", "pip", "list", "--format", "freeze"], check=True, capture_output=True, text=True
-    )
-    packages = {line.split("==")[0] for line in listed.stdout.split()} - {"pip", "setuptools"}
-    assert "heliopsf" in packages and len(packages) <= 25
-    write_image(tmp_path / "image.fits", WAVELNTH=171, CDELT1=2.0, CDELT2=2.0)
-    (tmp_path / "small.toml").write_text(SMALL_INSTRUMENT)
-    subprocess.run([str(python), "-c", THREE_LINES], cwd=tmp_path, check=True)
-
-
 SCRIPT = """
 import numpy as np
 

@@ -21,7 +21,7 @@ TEXTS = [page for page in PAGES if page.suffix == ".md"] + [
 ]
 
 
-def test_every_page_is_in_the_navigation_of_the_site() -> None:
+def test_every_page_is_in_the_navigation_and_the_start_page_names_every_tutorial() -> None:
     blocks = [
         block
         for page in PAGES
@@ -32,6 +32,8 @@ def test_every_page_is_in_the_navigation_of_the_site() -> None:
     assert sorted(listed) == sorted(
         ["_gallery/index", *(page.stem for page in PAGES if page.stem != "index")]
     )
+    named = re.findall(r"_gallery/(\w+)\.rst", (DOCS / "index.md").read_text("utf-8"))
+    assert named == [path.stem for path in TUTORIALS]
 
 
 def test_relative_links_lead_to_files(subtests: pytest.Subtests) -> None:
@@ -64,11 +66,6 @@ def test_the_commands_of_tutorials_and_their_options_exist(subtests: pytest.Subt
                     _, command, words = command.resolve_command(click.Context(command), words)
                 known = {name for one in command.params for name in (*one.opts, *one.secondary_opts)}
                 assert {word for word in words if word.startswith("-")} <= known, line
-
-
-def test_the_start_page_names_every_tutorial() -> None:
-    named = re.findall(r"_gallery/(\w+)\.rst", (DOCS / "index.md").read_text("utf-8"))
-    assert named == [path.stem for path in TUTORIALS]
 
 
 def test_the_site_names_no_other_host() -> None:

@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from collections import defaultdict
 from collections.abc import Iterator
 from importlib.metadata import distributions
 from pathlib import Path
@@ -19,6 +20,7 @@ from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 
 from service.openapi import description
+from tests.conftest import pytest_collection_modifyitems
 
 HERE = Path(__file__).parents[2]
 # What --local and the demo need is imported by the command line alone.
@@ -29,7 +31,8 @@ def imports(path: Path) -> Iterator[str]:
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module:
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0 and node.module, f"{path}: expected absolute imports"
             yield node.module
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
@@ -195,9 +198,13 @@ def test_commands_print_by_one_function() -> None:
     assert printing == ["progress.py"]
 
 
-def test_the_description_of_the_interface_is_what_the_application_generates() -> None:
+def test_the_interface_and_the_settings_are_described_as_the_code_has_them() -> None:
     kept = (HERE / "openapi" / "openapi.json").read_text()
     assert kept == description(), "`make openapi` writes it anew"
+    from workers.settings_table import settings_table
+
+    kept = (HERE / "docs" / "settings.md").read_text("utf-8")
+    assert kept == settings_table(), "`make settings` writes it anew"
 
 
 def test_the_readme_tells_the_commands_that_ci_runs() -> None:
@@ -318,13 +325,6 @@ def test_every_installed_pin_runs_on_the_oldest_python() -> None:
     assert refused == {}, "pin an older version in constraints.txt"
 
 
-def test_the_page_of_settings_is_made_from_the_settings_class() -> None:
-    from workers.settings_table import settings_table
-
-    kept = (HERE / "docs" / "settings.md").read_text("utf-8")
-    assert kept == settings_table(), "`make settings` writes it anew"
-
-
 @pytest.mark.parametrize("folder", ["benchmarks", "studies"])
 def test_scripts_that_no_test_runs_can_be_imported(folder: str) -> None:
     """`benchmarks/race` runs in environments of other packages."""
@@ -332,3 +332,79 @@ def test_scripts_that_no_test_runs_can_be_imported(folder: str) -> None:
         name = ".".join(path.relative_to(HERE).with_suffix("").parts)
         if path.stem != "__main__" and ".race" not in name:
             importlib.import_module(name.removesuffix(".__init__"))
+
+
+def test_the_blind_set_and_the_gap_library_share_no_code(subtests: pytest.Subtests) -> None:
+    for room, other in (("blind", "gap"), ("gap", "blind")):
+        with subtests.test(str((room, other))):
+            files = sorted((HERE / "psfcore" / room).rglob("*.py"))
+            assert files
+            wrong = [
+                (str(path.relative_to(HERE)), name)
+                for path in files
+                for name in imports(path)
+                if name == f"psfcore.{other}" or name.startswith(f"psfcore.{other}.")
+            ]
+            assert wrong == []
+
+
+# --- no circular imports between rooms ---
+
+
+PACKAGES = ("heliopsf", "psfcore", "workers", "service", "benchmarks", "studies")
+
+
+def _files() -> list[Path]:
+    found = [
+        path.relative_to(HERE) for package in PACKAGES for path in sorted((HERE / package).rglob("*.py"))
+    ]
+    assert len(found) > 100
+    return found
+
+
+def _module(path: Path) -> str:
+    parts = path.with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def _graphs() -> dict[str, dict[str, set[str]]]:
+    """For every folder: which of its members (files and folders) import which of its other members."""
+    files = _files()
+    modules = {_module(path): path for path in files if path.name != "__init__.py"}
+    graphs: dict[str, dict[str, set[str]]] = defaultdict(lambda: defaultdict(set))
+    for path in files:
+        for name in imports(HERE / path):
+            target = modules.get(name)
+            if target is None or target == path:
+                continue
+            here, there = path.parts, target.parts
+            level = next(i for i, (a, b) in enumerate(zip(here, there, strict=False)) if a != b)
+            graphs["/".join(here[:level]) or "."][here[level]].add(there[level])
+    return graphs
+
+
+def _circle(graph: dict[str, set[str]]) -> list[str]:
+    """Members that are left once everything without imports inside the folder is taken away, again and again."""
+    left = {name: set(targets) for name, targets in graph.items()}
+    while True:
+        ends = {target for targets in left.values() for target in targets} - set(left)
+        free = {name for name, targets in left.items() if targets <= ends}
+        if not free:
+            return sorted(left)
+        left = {name: targets - free for name, targets in left.items() if name not in free}
+
+
+def test_a_circle_is_found() -> None:
+    assert _circle({"a": {"b"}, "b": {"c"}, "d": {"a"}}) == []
+    assert _circle({"a": {"b"}, "b": {"c", "a"}, "c": set()}) == ["a", "b"]
+
+
+def test_no_circular_imports_at_any_level() -> None:
+    circles = {level: circle for level, graph in _graphs().items() if (circle := _circle(graph))}
+    assert circles == {}
+
+
+def test_tests_of_one_id_are_refused(request: pytest.FixtureRequest) -> None:
+    pytest_collection_modifyitems(request.config, [request.node])
+    with pytest.raises(pytest.UsageError, match="test_tests_of_one_id_are_refused"):
+        pytest_collection_modifyitems(request.config, [request.node, request.node])

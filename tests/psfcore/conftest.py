@@ -26,11 +26,6 @@ LIMITS = FitsLimits(max_pixels=4096 * 4096)
 
 
 @pytest.fixture(scope="session")
-def limits() -> FitsLimits:
-    return LIMITS
-
-
-@pytest.fixture(scope="session")
 def real() -> Callable[[str], Path]:
     """Path of a real data file; skips the test where it is not at hand."""
     shared = Path(os.environ.get("HELIOPSF_SHARED", Path(__file__).parents[3] / "shared"))

@@ -24,27 +24,18 @@ def test_a_difference_is_relative_to_the_largest_value() -> None:
     assert not found.same and found.values_that_differ == 1
     assert found.largest_relative == pytest.approx(0.02 / 4.0)
     assert found.sha256[0] != found.sha256[1]
-
-
-def test_zero_of_the_other_sign_differs_only_in_its_bits() -> None:
     again = IMAGE.copy()
     again[1, 1] = -0.0
     found = compare(IMAGE, again)
     assert not found.same and (found.largest_relative, found.values_that_differ) == (0.0, 0)
-
-
-def test_a_difference_that_is_not_defined_is_none() -> None:
+    found = compare(np.ones(3, "f4"), np.ones(3, "f8"))
+    assert not found.same and found.largest_relative == 0.0
     assert compare(IMAGE, IMAGE[:1]).largest_relative is None
     assert compare(IMAGE, IMAGE[:1]).values_that_differ is None
     filled = np.nan_to_num(IMAGE)
     found = compare(IMAGE, filled)
     assert not found.same and found.largest_relative is None and found.values_that_differ == 1
     assert compare(np.zeros(3), np.ones(3)).largest_relative is None
-
-
-def test_equal_values_of_another_number_type_are_not_the_same_bits() -> None:
-    found = compare(np.ones(3, "f4"), np.ones(3, "f8"))
-    assert not found.same and found.largest_relative == 0.0
 
 
 def normal_matrix(rows: int = 20, columns: int = 4) -> np.ndarray:
@@ -61,7 +52,7 @@ def test_units_do_not_matter() -> None:
     assert cut[0, 0] < 1e-3 * expected[0, 0]
 
 
-def test_an_undetermined_direction_has_no_variance_and_others_keep_theirs() -> None:
+def test_an_undetermined_direction_has_no_variance() -> None:
     """The data determine only the sum of two parameters: the sum has a variance, the difference has none."""
     normal = np.array([[4.0, 4.0, 0.0], [4.0, 4.0, 0.0], [0.0, 0.0, 25.0]])
     inverse = scaled_inverse(normal, weakest=1e-9)
@@ -69,7 +60,4 @@ def test_an_undetermined_direction_has_no_variance_and_others_keep_theirs() -> N
     assert total @ inverse @ total == pytest.approx(1 / 4)
     assert difference @ inverse @ difference == pytest.approx(0, abs=1e-12)
     assert inverse[2, 2] == pytest.approx(1 / 25)
-
-
-def test_a_parameter_without_influence_has_no_variance() -> None:
     np.testing.assert_allclose(scaled_inverse(np.diag([4.0, 0.0])), np.diag([0.25, 0.0]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -12,8 +13,8 @@ from astropy.io.fits import Header
 from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import Convolver, linear_convolve
-from psfcore.errors import DataError
-from psfcore.image import Image
+from psfcore.errors import DataError, HeaderError
+from psfcore.image import Image, MaskBit
 from psfcore.psf import Psf, crop_centred, crop_or_pad, cumulative_curve, encircled_energy, radial_profile
 from psfcore.psf_sampling import check_compatible, psf_for_image, rebinned, rebinned_kernel
 from psfcore.scatter.power_law import scatter_kernel
@@ -48,21 +49,15 @@ def test_a_wrong_psf_is_refused() -> None:
         assert caught.value.code == code
 
 
-def test_encircled_energy_counts_by_brute_force() -> None:
+def test_encircled_energy_curve_and_profile_by_brute_force_and_formula() -> None:
     kernel = np.random.default_rng(3).random((12, 15))
     y, x = np.mgrid[:12, :15]
     r2 = (y - 6) ** 2 + (x - 7) ** 2
     radii = np.array([0.0, 0.5, 1.0, np.sqrt(2), 1.9, np.sqrt(5), np.sqrt(13), 7.3, 50.0])
     expected = [kernel[r2 <= round(r * r, 9)].sum() for r in radii]
     np.testing.assert_allclose(encircled_energy(kernel, radii), expected, rtol=1e-12)
-
-
-def test_cumulative_curve_of_a_delta_is_zero_and_includes_light_outside_the_array() -> None:
     np.testing.assert_allclose(cumulative_curve(delta(16), [0.0, 0.5, 5.0]), 0.0, atol=1e-12)
     np.testing.assert_allclose(cumulative_curve(0.8 * delta(16), [0.5, 99.0]), 20.0)
-
-
-def test_radial_profile_of_a_function_of_radius_follows_it() -> None:
     radius, weight = radial_profile(gaussian(65, 6.0))
     np.testing.assert_allclose(weight[:20] / weight[0], np.exp(-(radius[:20] ** 2) / 72), rtol=0.05)
 
@@ -92,14 +87,6 @@ def test_plate_scales_must_agree_to_a_percent_where_known() -> None:
         else:
             with pytest.raises(DataError, match=r"plate-scale-mismatch.*0\.492"):
                 check_compatible(image, psf)
-
-
-def test_cropping_keeps_the_centre_and_does_not_renormalise() -> None:
-    for size, new in itertools.product((16, 17), (8, 9)):
-        kernel = gaussian(size, 5.0)
-        part = crop_centred(kernel, (new, new))
-        assert part[new // 2, new // 2] == kernel[size // 2, size // 2]
-        assert part.sum() < 1
 
 
 def test_a_kernel_is_cut_or_padded_about_its_centre() -> None:
@@ -152,18 +139,7 @@ def test_rebinning_is_exact_where_the_scene_is_constant_within_binned_pixels() -
         np.testing.assert_allclose(see(scene, rebinned_kernel(kernel, factor)), expected, rtol=0, atol=1e-12)
 
 
-def test_rebinning_holds_on_a_smooth_scene() -> None:
-    """For structures of 6 binned pixels (sigma) on a sky, both ways agree to half a percent."""
-    kernel = wings(256).kernel
-    for factor in FACTORS:
-        y, x = np.mgrid[: 48 * factor, : 60 * factor] / factor
-        scene = 20 + 300 * np.exp(-((y - 20.3) ** 2 + (x - 31.6) ** 2) / (2 * 6.0**2))
-        expected = binned(see(scene, kernel), factor)
-        found = see(binned(scene, factor), rebinned_kernel(kernel, factor))
-        assert np.abs(found / expected - 1).max() < 0.005
-
-
-def test_energy_and_centre_are_kept_and_a_delta_stays_a_delta() -> None:
+def test_energy_and_centre_are_kept_and_light_beyond_the_reach_is_left_out() -> None:
     psf = wings(256)
     for factor in FACTORS:
         coarse = rebinned(psf, factor)
@@ -180,9 +156,6 @@ def test_energy_and_centre_are_kept_and_a_delta_stays_a_delta() -> None:
     for wrong in (-1, 0, 17, 100):
         with pytest.raises(DataError, match="bad-binning"):
             rebinned(make_psf(delta(32)), wrong)
-
-
-def test_light_beyond_the_full_reach_is_left_out_before_binning() -> None:
     kernel = np.zeros((2100, 2100))
     kernel[1050, 1050] = 0.999
     kernel[3, 1050] = 0.2  # farther than 1024 px
@@ -198,7 +171,7 @@ def header(step_1: float | None, step_2: float | None = None, unit: str | None =
     return Header({key: value for key, value in cards.items() if value is not None})
 
 
-def test_the_psf_is_rebinned_to_the_pixels_of_the_image() -> None:
+def test_the_psf_is_rebinned_to_the_pixels_of_the_image_of_its_telescope() -> None:
     psf = wings(128)
     for of_image, factor in (
         (header(0.492), 1),
@@ -220,10 +193,7 @@ def test_the_psf_is_rebinned_to_the_pixels_of_the_image() -> None:
             psf_for_image(psf, of_image)
     anywhere = make_psf(delta(32))
     assert psf_for_image(anywhere, header(3.3)) is anywhere, "a PSF without plate scale"
-
-
-def test_pixels_of_another_telescope_are_not_binned_pixels() -> None:
-    """An FSI pixel equals nine HRI_EUV pixels to 0.3 %."""
+    # An FSI pixel equals nine HRI_EUV pixels to 0.3 %.
     psf = replace(wings(128), instrument="hri_euv")
     own, other = header(0.984), header(4.44012445)
     own["DETECTOR"], other["DETECTOR"] = "HRI_EUV", "FSI"
@@ -231,3 +201,29 @@ def test_pixels_of_another_telescope_are_not_binned_pixels() -> None:
     with pytest.raises(DataError, match="or binned images of its instrument") as caught:
         psf_for_image(psf, other)
     assert caught.value.code == "plate-scale-mismatch"
+
+
+# --- images ---
+
+
+def test_a_wrong_image_is_refused_and_any_bit_makes_a_pixel_invalid() -> None:
+    for pixels, mask_shape, code in (
+        (np.ones(400), (400,), "not-2d"),
+        (np.ones((15, 200)), (15, 200), "too-small"),
+        (np.ones((20, 20)), (20, 21), "mask-shape"),
+        (np.full((20, 20), np.nan), (20, 20), "unmasked-nonfinite"),
+    ):
+        with pytest.raises(DataError, match=code):
+            Image(pixels, np.zeros(mask_shape, np.uint8), fits.Header(), None, None)
+    mask = np.zeros((16, 16), np.uint8)
+    mask[0, 0], mask[1, 1] = MaskBit.NONFINITE, MaskBit.SATURATED
+    image = Image(np.ones((16, 16)), mask, fits.Header(), None, None)
+    assert not image.valid[0, 0]
+    assert not image.valid[1, 1]
+    assert image.valid.sum() == 254
+
+
+def test_errors_can_be_pickled() -> None:
+    error = pickle.loads(pickle.dumps(HeaderError("not-fits", "expected FITS; got soup")))
+    assert isinstance(error, HeaderError)
+    assert (error.code, error.message) == ("not-fits", "expected FITS; got soup")

@@ -49,7 +49,9 @@ def test_a_damaged_file_is_removed_and_not_used(cache: PsfCache) -> None:
     assert list(cache.folder.iterdir()) == []
 
 
-def test_folder_and_files_are_closed_to_other_users(cache: PsfCache) -> None:
+def test_folder_and_files_are_those_of_one_user_alone(
+    cache: PsfCache, monkeypatch: pytest.MonkeyPatch
+) -> None:
     cache.folder.mkdir(parents=True)
     cache.folder.chmod(0o755)
     umask = os.umask(0)
@@ -60,15 +62,11 @@ def test_folder_and_files_are_closed_to_other_users(cache: PsfCache) -> None:
     (file,) = cache.folder.iterdir()
     assert cache.folder.stat().st_mode & 0o777 == 0o700
     assert file.stat().st_mode & 0o777 == 0o600
-
-
-def test_a_folder_of_another_user_is_not_used(cache: PsfCache, monkeypatch: pytest.MonkeyPatch) -> None:
     keep(cache, ONE, b"weights")
     monkeypatch.setattr(cache_module.os, "geteuid", lambda: cache.folder.stat().st_uid + 1)
     assert cache.find(ONE, "fits") is None and cache.psfs() == [] and cache.clear() == 0
-    with pytest.raises(DataError) as caught:
+    with pytest.raises(DataError, match="cache-of-another-user"):
         keep(cache, OTHER, b"weights")
-    assert caught.value.code == "cache-of-another-user"
 
 
 def test_the_psf_that_was_not_used_for_the_longest_time_makes_room(cache: PsfCache) -> None:
@@ -88,7 +86,7 @@ def test_the_last_psf_stays_and_a_file_that_is_too_large_is_not_kept(cache: PsfC
     assert {path.name[:64] for path in cache.folder.iterdir()} == {ONE}
 
 
-def test_a_failed_write_leaves_nothing(cache: PsfCache) -> None:
+def test_failed_writes_and_killed_processes_leave_nothing(cache: PsfCache) -> None:
     def half(path: Path) -> None:
         path.write_bytes(b"half")
         raise InterruptedError
@@ -96,10 +94,6 @@ def test_a_failed_write_leaves_nothing(cache: PsfCache) -> None:
     with pytest.raises(InterruptedError):
         cache.keep(ONE, "fits", half)
     assert list(cache.folder.iterdir()) == []
-
-
-def test_temporary_files_of_killed_processes_are_removed(cache: PsfCache) -> None:
-    cache.folder.mkdir(parents=True)
     for name, changed_at in ((".old.part", 0), (".new.part", None)):
         (cache.folder / name).write_bytes(b"half")
         if changed_at is not None:

@@ -28,7 +28,7 @@ def ideal(**left: float | tuple[float, float]) -> dict[str, Any]:
     }
 
 
-def test_a_test_finds_an_effect_with_the_power_of_the_textbook_and_of_simulated_tests() -> None:
+def test_tests_and_decisions_have_the_power_of_simulated_ones() -> None:
     for among, textbook in ((1, {3.84: 0.5, 10.5: 0.9, 18.4: 0.99}), (18, {8.9: 0.5, 18.3: 0.9, 28.2: 0.99})):
         for lam, probability in textbook.items():
             assert excluded(lam, among) == pytest.approx(probability, abs=0.005), (among, lam)
@@ -36,10 +36,7 @@ def test_a_test_finds_an_effect_with_the_power_of_the_textbook_and_of_simulated_
     score = np.sqrt(12.0) + rng.standard_normal(200_000)
     threshold = -np.quantile(rng.standard_normal(2_000_000), LEVEL / (2 * 5))
     assert excluded(12.0, 5) == pytest.approx(float(np.mean(score > threshold)), abs=0.01)
-
-
-def test_a_decision_among_rivals() -> None:
-    """Between two Gaussians; a guess; and among orthogonal templates of equal energy, whose squared distance is twice the energy."""
+    # Between two Gaussians; a guess; and among orthogonal templates of equal energy, whose squared distance is twice the energy.
     for lam in (0.0, 1.0, 7.0, 40.0):
         assert best_of([lam]) == pytest.approx(float(ndtr(np.sqrt(lam) / 2)), abs=1e-6)
     assert best_of([]) == 1.0
@@ -52,7 +49,7 @@ def test_a_decision_among_rivals() -> None:
     assert best_of([2 * energy] * rivals) == pytest.approx(right, abs=0.005)
 
 
-def test_the_rivals_of_an_effect_and_of_a_pair() -> None:
+def test_the_rivals_of_an_effect_of_a_pair_and_of_a_field() -> None:
     found = known(ideal(none=50.0, a=0.2, b=6.0, a__b=0.1), ["a"], ["a"], in_library=True)
     assert (found.noncentrality, found.rival) == (50.0, 6.0)
     assert found.alone == pytest.approx(float(ndtr(np.sqrt(6.0) / 2)), abs=1e-6)
@@ -63,9 +60,6 @@ def test_the_rivals_of_an_effect_and_of_a_pair() -> None:
     found = known(left, ["b", "a"], ["a", "b"], in_library=True)
     assert found.rival == 11.0
     assert found.alone == pytest.approx(min(excluded(12.0, 3), best_of([35.0, 11.0])))
-
-
-def test_an_effect_that_need_not_be_named_must_be_explained_if_it_shows() -> None:
     sun = ideal(none=950.0, a=900.0, b=925.0, sun=50.0, a__b=890.0, a__sun=0.5, b__sun=20.0)
     found = known(sun, ["a"], ["a", "sun"], in_library=True)
     assert found.rival == 20.0  # another effect beside the same Sun, not another effect alone
@@ -75,9 +69,6 @@ def test_an_effect_that_need_not_be_named_must_be_explained_if_it_shows() -> Non
     # Of a withheld effect every hypothesis is a rival.
     found = known(ideal(none=90.0, a=40.0, b=60.0, a__b=10.0), ["stripes"], ["stripes"], in_library=False)
     assert (found.rival, found.alone) == (10.0, pytest.approx(excluded(10.0, 2)))
-
-
-def test_an_effect_that_adapts_to_the_data_pays_for_it() -> None:
     left = ideal(none=90.0, a=0.0, field=(2.0, 15.0))
     assert known(left, ["a"], ["a"], in_library=True).rival == pytest.approx(17.0)
     # The truth pays too: without an effect, nothing is to be paid.

@@ -82,22 +82,27 @@ def test_an_effect_changes_images_unless_its_strength_is_0(
         moved = np.array(changed.mean_rate(changed.all_expected(), 5))
         assert np.isfinite(moved).all(), name
         assert np.abs(moved / np.array(clean) - 1).max() > 1e-3, name
+    exposures = [rate * shot.exposure_s for rate, shot in zip(clean, plan.shots, strict=True)]
+    level = Chain(effect_free, [effect_of("saturation_fill", 0.03)]).saturation_dn(clean)
+    assert level is not None
+    high = np.concatenate(
+        [dn.ravel() for dn, shot in zip(exposures, plan.shots, strict=True) if shot.gain_mode == HIGH]
+    )
+    assert np.maximum(high - level, 0).sum() / high.sum() == pytest.approx(0.03, abs=0.002)
 
 
-def test_equal_seeds_give_equal_effects_and_other_seeds_others(plan: Plan) -> None:
-    for effect in EFFECTS.values():
-        first, second, third = (effect.drawn(plan, np.random.default_rng(seed)) for seed in (1, 1, 2))
-        assert first == second
-        others = (effect.drawn(plan, np.random.default_rng(seed)) for seed in range(3, 9))
-        assert not first.parameters or any(other != third for other in others)
-
-
-def test_the_binned_scatter_kernel_follows_the_power_law(optics: FineOptics) -> None:
+def test_kernels_follow_the_power_law_sum_to_1_and_rotate(optics: FineOptics) -> None:
     boxed, law = binned_kernel(optics.scatter), anisotropic_kernel(LAW, 2 * SIZE_PX)
     middle = SIZE_PX
     assert boxed[middle, middle] == pytest.approx(1 - LAW.total, abs=1e-9)
     near = (slice(middle - 20, middle + 21), slice(middle + 1, middle + 21))
     np.testing.assert_allclose(boxed[near], law[near], rtol=0.02)
+    kernel = binned_glass(GLASS)
+    assert kernel.sum() == pytest.approx(1.0, abs=1e-12)
+    assert np.unravel_index(kernel.argmax(), kernel.shape) == (32, 32)
+    straight, turned = GLASS.fine(), GLASS.fine(turn_deg=90.0)
+    np.testing.assert_allclose(turned, straight, atol=1e-12)  # a square mesh, a quarter turn
+    assert np.abs(GLASS.fine(turn_deg=5.0) - straight).sum() > 0.01
 
 
 def test_a_scene_uniform_within_pixels_gives_the_same_with_fine_and_binned_kernels() -> None:
@@ -108,15 +113,6 @@ def test_a_scene_uniform_within_pixels_gives_the_same_with_fine_and_binned_kerne
     seen = binned(Convolver(kernel, fine.shape, dtype=np.float64).apply(fine), FINE)
     boxed = Convolver(binned_kernel(kernel), coarse.shape, dtype=np.float64).apply(coarse)
     np.testing.assert_allclose(seen, boxed, atol=2e-4)  # the outermost fine row has no partner
-
-
-def test_the_known_psf_sums_to_1_and_its_orders_rotate() -> None:
-    kernel = binned_glass(GLASS)
-    assert kernel.sum() == pytest.approx(1.0, abs=1e-12)
-    assert np.unravel_index(kernel.argmax(), kernel.shape) == (32, 32)
-    straight, turned = GLASS.fine(), GLASS.fine(turn_deg=90.0)
-    np.testing.assert_allclose(turned, straight, atol=1e-12)  # a square mesh, a quarter turn
-    assert np.abs(GLASS.fine(turn_deg=5.0) - straight).sum() > 0.01
 
 
 def test_effects_of_the_optics_and_charge_that_repels_conserve_light(
@@ -132,18 +128,15 @@ def test_effects_of_the_optics_and_charge_that_repels_conserve_light(
     assert spread.std() < clean[2].std()
 
 
-def test_scatter_that_depends_on_the_field_moves_light_between_pixels(plan: Plan, optics: FineOptics) -> None:
+def test_effects_change_light_where_and_as_they_say(
+    plan: Plan, optics: FineOptics, effect_free: EffectFree, clean: list[np.ndarray]
+) -> None:
     effect = effect_of("field_dependent_scatter", 0.5, angle_deg=0.0, bowl=0.5)
     lit = np.zeros(optics.field)
     lit[SIZE_PX, 2 * SIZE_PX - 40] = 1.0  # a point away from the centre along +x: more scatter
     added = apply_effects([effect], "spread", np.zeros_like(lit), lit, optics, Moment(plan, 0))
     assert added[SIZE_PX, 2 * SIZE_PX - 40] < 0
     assert added[SIZE_PX + 21, SIZE_PX] > 0  # off the mesh's orders, which follow the core
-
-
-def test_a_moving_disc_uncovers_light_only_at_its_ends(
-    plan: Plan, effect_free: EffectFree, clean: list[np.ndarray]
-) -> None:
     effect = effect_of("occulter_motion", 1.0, angle_deg=0.0)
     shot = plan.shots[0]
     moved = Chain(effect_free, (effect,)).expected(0) - clean[0]
@@ -151,6 +144,13 @@ def test_a_moving_disc_uncovers_light_only_at_its_ends(
     ends = moved[row, [column - radius + 1, column + radius - 1]]
     sides = moved[[row - radius + 2, row + radius - 2], column]
     assert ends.min() > 5 * np.abs(sides).max()
+    tail = effect_of("occulter_tail", 10.0, angle_deg=0.0, length=2.0, fading=1.0)
+    chain, last = Chain(effect_free, [tail]), len(plan.shots) - 1
+    added = [chain.expected(index) - clean[index] for index in (0, last)]
+    for index, light in zip((0, last), added, strict=True):
+        row, column = np.unravel_index(light.argmax(), light.shape)
+        assert np.hypot(row - plan.shots[index].y_px, column - plan.shots[index].x_px) < 3
+    assert added[1].max() == pytest.approx(added[0].max() / 2, rel=0.1)
 
 
 def test_effects_of_the_readout_change_dn_as_defined(plan: Plan) -> None:
@@ -171,18 +171,14 @@ def test_effects_of_the_readout_change_dn_as_defined(plan: Plan) -> None:
     dn = np.array([[5.0, 100.0, 1000.0]])
     after = apply_effects([faint], "read_out", dn, Moment(plan, 0), [])
     np.testing.assert_allclose(after, [[4.0, 100.0, 1000.0]])
-
-
-def test_saturation_loses_the_share_of_light_given_by_its_strength(
-    plan: Plan, effect_free: EffectFree, clean: list[np.ndarray]
-) -> None:
-    exposures = [rate * shot.exposure_s for rate, shot in zip(clean, plan.shots, strict=True)]
-    level = Chain(effect_free, [effect_of("saturation_fill", 0.03)]).saturation_dn(clean)
-    assert level is not None
-    high = np.concatenate(
-        [dn.ravel() for dn, shot in zip(exposures, plan.shots, strict=True) if shot.gain_mode == HIGH]
-    )
-    assert np.maximum(high - level, 0).sum() / high.sum() == pytest.approx(0.03, abs=0.002)
+    trails = effect_of("charge_trails", 0.1, trail_px=5.0)
+    for row, lost in ((99, 10.0), (9, 1.0)):
+        dn = np.zeros((100, 3))
+        dn[row, 1] = 100.0
+        after = apply_effects([trails], "read_out", dn, Moment(plan, 0), [])
+        assert after[row, 1] == pytest.approx(100 - lost)
+        assert (after[:row] == 0).all() and (after[:, [0, 2]] == 0).all()
+    assert after.sum() == pytest.approx(100.0, abs=1e-6)  # of row 9, whose trail ends before the last row
 
 
 def test_every_effect_of_the_tests_leaves_a_residual_in_the_discs(
@@ -200,26 +196,3 @@ def test_every_effect_of_the_tests_leaves_a_residual_in_the_discs(
             chain = Chain(effect_free, [effect.at(strength)])
             left_pct.append(estimator.left(chain.mean_rate(chain.all_expected(), 5)).after_refit_pct)
         assert 0.1 < left_pct[0] < left_pct[1] and left_pct[1] > 3, (name, left_pct)
-
-
-def test_the_light_of_a_tail_moves_with_the_disc_and_fades(
-    plan: Plan, effect_free: EffectFree, clean: list[np.ndarray]
-) -> None:
-    tail = effect_of("occulter_tail", 10.0, angle_deg=0.0, length=2.0, fading=1.0)
-    chain, last = Chain(effect_free, [tail]), len(plan.shots) - 1
-    added = [chain.expected(index) - clean[index] for index in (0, last)]
-    for index, light in zip((0, last), added, strict=True):
-        row, column = np.unravel_index(light.argmax(), light.shape)
-        assert np.hypot(row - plan.shots[index].y_px, column - plan.shots[index].x_px) < 3
-    assert added[1].max() == pytest.approx(added[0].max() / 2, rel=0.1)
-
-
-def test_traps_move_charge_to_later_rows_and_the_last_rows_lose_most(plan: Plan) -> None:
-    trails = effect_of("charge_trails", 0.1, trail_px=5.0)
-    for row, lost in ((99, 10.0), (9, 1.0)):
-        dn = np.zeros((100, 3))
-        dn[row, 1] = 100.0
-        after = apply_effects([trails], "read_out", dn, Moment(plan, 0), [])
-        assert after[row, 1] == pytest.approx(100 - lost)
-        assert (after[:row] == 0).all() and (after[:, [0, 2]] == 0).all()
-    assert after.sum() == pytest.approx(100.0, abs=1e-6)  # of row 9, whose trail ends before the last row

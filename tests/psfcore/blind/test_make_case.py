@@ -111,7 +111,7 @@ def test_the_sun_beside_a_strong_effect_keeps_the_strength_that_was_drawn(tmp_pa
     assert truth["target_pct"][1] is None
 
 
-def test_the_transit_of_a_case_can_be_read(made: BlindSet) -> None:
+def test_the_transit_of_a_case_contains_nothing_of_the_truth(made: BlindSet) -> None:
     transit = read_transit(made.transit(0), LIMITS)
     assert (len(transit.frames), transit.shape) == (IMAGES, (SIZE_PX, SIZE_PX))
     places = np.array([[frame.place.x_px, frame.place.y_px] for frame in transit.frames])
@@ -120,9 +120,6 @@ def test_the_transit_of_a_case_can_be_read(made: BlindSet) -> None:
     for frame, at in zip(transit.frames, exact, strict=True):
         row, column = np.rint(at[::-1]).astype(int)
         assert frame.pixels[row - 3 : row + 4, column - 3 : column + 4].mean() < frame.pixels.mean()
-
-
-def test_saturated_images_give_their_level_in_the_header(made: BlindSet) -> None:
     level = made.truth(1)["plan"]["saturation_dn"]
     clipped = 0
     for file in sorted(made.transit(1).glob("0*.fits")):
@@ -132,9 +129,6 @@ def test_saturated_images_give_their_level_in_the_header(made: BlindSet) -> None
             assert header["SATURATE"] == level and pixels.max() <= level
             clipped += int((pixels == level).sum())
     assert clipped > 0
-
-
-def test_the_transit_contains_nothing_of_the_truth(made: BlindSet) -> None:
     words = [*EFFECTS, "clean", "effect", "truth", "strength", "salt"]
     for number in (0, 1):
         folder = made.transit(number)
@@ -182,12 +176,20 @@ def test_the_truth_contains_what_an_effect_leaves_and_a_map_of_the_light_that_it
     assert "light_map" not in made.truth(1)
 
 
-def test_a_clean_case_has_a_transit_alone(tmp_path: Path) -> None:
+def test_a_clean_case_has_a_transit_alone_also_of_a_given_scene(tmp_path: Path) -> None:
     truth = make(drawn(4, clean_only=True), tmp_path / "transit", tmp_path / "expected")
     assert (truth["effects"], truth["left_after_refit_pct"]) == ([], 0.0)
     assert truth["clean_left_pct"] < 0.8
     assert not (tmp_path / "expected").exists(), "an ideal observer of clean data needs no images"
     assert len(read_transit(tmp_path / "transit", LIMITS).frames) == IMAGES
+    clean_case = drawn(4, clean_only=True)
+    image = 100 + 20 * np.random.default_rng(1).standard_normal((300, 300))
+    image[5, 5] = np.nan
+    scenes = case_scenes(clean_case, [image])
+    assert all(scene.shape == (2 * SIZE_PX, 2 * SIZE_PX) and scene.min() >= 0 for scene in scenes.values())
+    np.testing.assert_array_equal(scenes[1][:, ::-1], scenes[3])
+    with pytest.raises(DataError, match="bad-scene"):
+        case_scenes(clean_case, [np.zeros((300, 300))])
 
 
 def test_the_ideal_observer_measures_what_the_maker_of_a_case_measured(
@@ -208,18 +210,7 @@ def test_the_ideal_observer_measures_what_the_maker_of_a_case_measured(
     assert left[("intensity_gradient",)] < 0.2 * left[()]
 
 
-def test_scenes_can_be_taken_from_images() -> None:
-    clean_case = drawn(4, clean_only=True)
-    image = 100 + 20 * np.random.default_rng(1).standard_normal((300, 300))
-    image[5, 5] = np.nan
-    scenes = case_scenes(clean_case, [image])
-    assert all(scene.shape == (2 * SIZE_PX, 2 * SIZE_PX) and scene.min() >= 0 for scene in scenes.values())
-    np.testing.assert_array_equal(scenes[1][:, ::-1], scenes[3])
-    with pytest.raises(DataError, match="bad-scene"):
-        case_scenes(clean_case, [np.zeros((300, 300))])
-
-
-def test_seals_catch_a_changed_truth(made: BlindSet, tmp_path: Path) -> None:
+def test_a_set_keeps_its_truth_its_plan_and_one_run(made: BlindSet, tmp_path: Path) -> None:
     copy = BlindSet(tmp_path)
     (tmp_path / "truth").mkdir()
     copy.seals_file.write_text(made.seals_file.read_text())
@@ -234,9 +225,6 @@ def test_seals_catch_a_changed_truth(made: BlindSet, tmp_path: Path) -> None:
     copy.seals_file.write_text(made.seals_file.read_text() + '{"case": 0, "sha256": "00"}\n')
     with pytest.raises(DataError, match="bad-seals"):
         copy.seals()
-
-
-def test_a_set_is_continued_only_with_its_own_plan_and_by_one_run(made: BlindSet, tmp_path: Path) -> None:
     before = made.truth_file(0).read_bytes(), made.seals_file.read_bytes()
     make_set(made.folder, TWO)
     assert (made.truth_file(0).read_bytes(), made.seals_file.read_bytes()) == before

@@ -98,9 +98,6 @@ def test_every_figure_of_the_answers_equals_the_one_computed_by_hand() -> None:
     # The true closure excludes what the sampling leaves.
     assert true_closure(MEASURED) == pytest.approx(1 - 1 / 25)
     assert true_closure(truth("clean")) is None
-
-
-def test_confusion_power_and_table_count_every_case_once() -> None:
     found = score(JUDGED)
     assert found["confusion"]["clean"] == {"none": 2, "inconclusive": 1, "ghost": 1}
     assert found["confusion"]["wide_halo"] == {"wide_halo": 1}
@@ -197,6 +194,17 @@ def test_every_figure_of_the_sets_equals_the_one_computed_by_hand() -> None:
         assert rows[figure]["value"] == (value if value is None else pytest.approx(value)), figure
     assert rows["set covers the truth"]["wilson95"] == pytest.approx(wilson(7, 11))
     assert set(rows) - set(FIGURES_OF_SETS) == set(COMPARED)
+    found = score(SETS)
+    told = found["cases"]
+    assert told[8]["set"] == [["ghost"], ["unknown"]]
+    assert (told[8]["noncentrality"], told[8]["rival"]) == (400.0, 400.0)
+    assert told[6]["ideal_alone"] is None
+    assert COMPARED[0] in table(found)
+    for rival, left_pct in ((9.0, 2.5), (None, math.nan)):
+        one = with_set("single", ["ghost"], [["ghost"]], rival=rival)
+        del one.truth["left_after_refit_pct"]
+        assert one.left_pct == pytest.approx(left_pct, nan_ok=True)
+    assert score([one])["cases"][0]["left_after_refit_pct"] is None
 
 
 def light(*values: float) -> dict[str, Any]:
@@ -275,7 +283,7 @@ def test_what_is_right_is_compared_with_what_could_be_known() -> None:
     assert (row["n"], row["value"], row["wilson95"]) == (1, None, None)
 
 
-def test_only_the_effects_that_show_must_be_named() -> None:
+def test_a_verdict_names_the_effects_that_show_and_nothing_else() -> None:
     pair = with_set("pair", ["ghost", "core_blur"], [["ghost"]], rival=400.0)
     pair.report.update(verdict="attributed", answer=["ghost"])
     # Of two effects that show, or of which none shows, both are required.
@@ -288,36 +296,16 @@ def test_only_the_effects_that_show_must_be_named() -> None:
     # Further effects cover the truth, but are not right.
     extra = with_set("single", ["ghost"], [["ghost", "persistence"]])
     assert extra.covers(("ghost", "persistence")) and not extra.is_right_and_alone()
-
-
-def test_the_score_tells_the_set_and_a_truth_without_a_residual_takes_that_of_the_ideal_observer() -> None:
-    found = score(SETS)
-    told = found["cases"]
-    assert told[8]["set"] == [["ghost"], ["unknown"]]
-    assert (told[8]["noncentrality"], told[8]["rival"]) == (400.0, 400.0)
-    assert told[6]["ideal_alone"] is None
-    assert COMPARED[0] in table(found)
-    for rival, left_pct in ((9.0, 2.5), (None, math.nan)):
-        one = with_set("single", ["ghost"], [["ghost"]], rival=rival)
-        del one.truth["left_after_refit_pct"]
-        assert one.left_pct == pytest.approx(left_pct, nan_ok=True)
-    assert score([one])["cases"][0]["left_after_refit_pct"] is None
-
-
-def test_a_verdict_is_right_if_it_states_the_truth_and_nothing_else() -> None:
     verdicts: list[tuple[str, list[str], str, list[str], bool]] = [
         ("clean", [], "none", [], True),
         ("clean", [], "inconclusive", [], False),
         ("unknown", ["stripes"], "unknown", [], True),
-        ("unknown", ["stripes"], "attributed", ["ghost"], False),
         ("single", ["ghost"], "attributed", ["ghost"], True),
         ("single", ["ghost"], "attributed", ["ghost", "core_blur"], False),
         ("single", ["ghost"], "tie", ["ghost"], False),
-        ("pair", ["ghost", "core_blur"], "attributed", ["ghost"], False),
         ("pair", ["ghost", "core_blur"], "attributed", ["core_blur", "ghost"], True),
         ("mixed", ["ghost", "stripes"], "unknown", ["ghost"], True),
         ("mixed", ["ghost", "stripes"], "unknown", [], False),
-        ("mixed", ["ghost", "stripes"], "attributed", ["ghost"], False),
     ]
     for kind, names, verdict, answer, right in verdicts:
         case = with_set(kind, names, [[]])

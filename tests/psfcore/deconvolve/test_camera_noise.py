@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from psfcore.image import Image
 from psfcore.instruments.model import Instrument, parse_instrument
 from psfcore.noise import Noise
 from tests.conftest import SMALL_INSTRUMENT
+from tests.psfcore.conftest import LIMITS
 
 AIA = {"TELESCOP": "SDO/AIA", "WAVELNTH": 171, "PIXLUNIT": "DN", "EXPTIME": 2.0}
 BRIGHTNESS = np.array([30.0, 100.0, 400.0])  # of most pixels of the scene, DN
@@ -52,35 +54,25 @@ def test_the_measured_figures_are_those_of_the_camera(gain: float, cards: dict[s
     assert found.as_json()["sigma"] == found.sigma
 
 
-def test_saturated_and_lost_pixels_do_not_count() -> None:
+def test_which_pixels_of_an_image_are_measured(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     image = image_of(Noise(1.0, 5.0))
     pixels = image.pixels.copy()
     pixels[::7, ::5] = np.nan
     holed = observation_of(pixels, image.header)
     assert measured_noise(holed).photon_gain_dn == pytest.approx(1.0, rel=0.1)
-
-
-def test_a_large_image_is_measured_in_parts_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    image = image_of(Noise(1.0, 5.0))
+    flat = observation_of(np.full((64, 64), 7.0), Header({"BUNIT": "DN"}))
+    with pytest.raises(DataError, match="no-noise-figures"):
+        measured_noise(flat)
+    found = measured_noise(image, np.sqrt(2.0 * np.maximum(image.pixels, 0) + 9.0))
+    assert found.source == "uncertainty"
+    assert found.variance(BRIGHTNESS, 1.0) == pytest.approx(2.0 * BRIGHTNESS + 9.0, rel=0.05)
     whole = measured_noise(image)
     monkeypatch.setattr("psfcore.deconvolve.camera_noise._MOST_PIXELS", image.pixels.size // 2)
     part = measured_noise(image)
     assert part.photon_gain_dn != whole.photon_gain_dn
     assert part.photon_gain_dn == pytest.approx(whole.photon_gain_dn, rel=0.05)
-
-
-def test_an_image_without_noise_has_no_figures() -> None:
-    flat = observation_of(np.full((64, 64), 7.0), Header({"BUNIT": "DN"}))
-    with pytest.raises(DataError) as caught:
-        measured_noise(flat)
-    assert caught.value.code == "no-noise-figures"
-
-
-def test_the_uncertainty_of_an_image_gives_its_figures() -> None:
-    image = image_of(Noise(1.0, 5.0))
-    found = measured_noise(image, np.sqrt(2.0 * np.maximum(image.pixels, 0) + 9.0))
-    assert found.source == "uncertainty"
-    assert found.variance(BRIGHTNESS, 1.0) == pytest.approx(2.0 * BRIGHTNESS + 9.0, rel=0.05)
 
 
 def test_given_figures_come_before_published_ones_and_these_before_measured_ones() -> None:
@@ -120,13 +112,9 @@ basis = "assumed"
         assert camera_noise(image_of(Noise(1.0, 5.0), **known, **cards), None, binning=1).source == "measured"
 
 
-def test_the_figures_of_a_real_camera_are_found_in_its_image(shared: Path) -> None:
+def test_the_figures_of_a_real_camera_are_found_in_its_image(real: Callable[[str], Path]) -> None:
     """AIA at 1600 angstrom, whose photons free one electron each: 0.12 DN per photon and 1.15 DN are published."""
-    path = shared / "data/real/occultation/AIA1600_venus_20120606_040731_UTC.0041.fits"
-    if not path.is_file():
-        pytest.skip(f"real data are not here: no file {path}")
-    from psfcore.fits.blocks import FitsLimits
-
-    found = measured_noise(read_observation(path, FitsLimits(max_pixels=2**24)))
+    path = real("occultation/AIA1600_venus_20120606_040731_UTC.0041.fits")
+    found = measured_noise(read_observation(path, LIMITS))
     assert found.photon_gain_dn == pytest.approx(0.12, rel=0.25)
     assert found.read_noise_dn == pytest.approx(1.15, rel=0.3)

@@ -45,15 +45,12 @@ def test_the_transforms_are_those_of_the_engine() -> None:
             assert sizes.transform == (engine.column_plan.length, engine.row_plan.length), (method, edges)
 
 
-def test_more_pixels_need_more_memory() -> None:
+def test_more_pixels_need_more_memory_and_what_does_not_fit_is_refused() -> None:
     base = deconvolution_bytes(Demand("richardson-lucy", (1024, 1024), (2048, 2048)))
     assert deconvolution_bytes(Demand("richardson-lucy", (2048, 1024), (2048, 2048))) > base + 20e6
     assert deconvolution_bytes(Demand("richardson-lucy", (1024, 1024), (2048, 2048), draws=4)) > base + 20e6
     assert deconvolution_bytes(Demand("richardson-lucy", (1024, 1024), (2048, 2048), edges="zero")) < base
     assert deconvolution_bytes(Demand("richardson-lucy", (1024, 1024), (64, 64))) < base - 32e6
-
-
-def test_what_does_not_fit_is_refused_with_both_figures() -> None:
     check_memory((4096, 2048), 100 * MIB, 100 * MIB)
     with pytest.raises(DataError) as refused:
         check_memory((4096, 2048), 101 * MIB, 100 * MIB)
@@ -79,7 +76,9 @@ def test_a_psf_is_read_once_and_a_binned_image_gets_the_psf_of_its_pixels_once(p
     np.testing.assert_array_equal(fitted.kernel, psf_for_image(whole, binned).kernel)
 
 
-def test_an_engine_is_made_once_for_a_psf_and_a_shape(psf_file: Path) -> None:
+def test_engines_are_made_once_and_the_oldest_are_removed(
+    psf_file: Path,
+) -> None:
     prepared = PreparedPsfs(2**30)
     psf, other = (read_psf(psf_file, LIMITS, parts=False) for _ in range(2))
     engine = prepared.engine_for(psf, SHAPE, SHAPE, 1)
@@ -90,9 +89,6 @@ def test_an_engine_is_made_once_for_a_psf_and_a_shape(psf_file: Path) -> None:
         prepared.engine_for(psf, SHAPE, SHAPE, 2),
     ]
     assert len({id(one) for one in (engine, *others)}) == 4
-
-
-def test_the_least_recently_used_are_removed_but_never_the_last(psf_file: Path) -> None:
     psf = read_psf(psf_file, LIMITS, parts=False)
     size = new_engine(psf, SHAPE, SHAPE, 1).nbytes
     assert size > 2 * 4 * SHAPE[0] * SHAPE[1]

@@ -81,7 +81,7 @@ def test_a_box_alone_differs_from_the_whole_image_by_at_most_its_bound(
         assert np.abs(image.pixels[box.slices] - expected).max() > 2 * result.of_box.error
 
 
-def test_the_bound_holds_before_and_after_convergence(image: Image, psf: Psf) -> None:
+def test_the_bound_holds_before_convergence_and_at_an_edge(image: Image, psf: Psf) -> None:
     for method, steps in (
         ("richardson-lucy", 1),
         ("linear", 2),
@@ -90,9 +90,6 @@ def test_the_bound_holds_before_and_after_convergence(image: Image, psf: Psf) ->
     ):
         result, expected, _ = both(image, psf, method, HOLE, largest_error=0.3, steps=steps)
         assert 0 < np.abs(result.pixels - expected).max() <= result.of_box.error, (method, steps)
-
-
-def test_the_bound_holds_at_an_edge_of_the_image(image: Image, psf: Psf) -> None:
     inner = np.s_[8:, 8:]  # at the edge itself, the margin of the whole image is deconvolved too
     for method in ("richardson-lucy", "linear"):
         for edges in ("zero", "symmetric"):
@@ -111,7 +108,7 @@ def test_an_image_of_coarse_pixels_has_the_same_bound() -> None:
     assert np.abs(result.pixels - expected).max() <= result.of_box.error <= 0.02 * expected.mean() * 1.5
 
 
-def test_a_smaller_error_needs_a_wider_rim(image: Image, psf: Psf) -> None:
+def test_a_smaller_error_needs_a_wider_rim_up_to_the_whole_image(image: Image, psf: Psf) -> None:
     rims, errors = [], []
     for largest in (0.5, 0.2, 0.01):
         result, expected, alone = both(image, psf, "linear", HOLE, largest_error=largest)
@@ -122,9 +119,6 @@ def test_a_smaller_error_needs_a_wider_rim(image: Image, psf: Psf) -> None:
         )
     assert rims[0] < rims[1] < rims[2]
     assert errors[0] > errors[1] > errors[2]
-
-
-def test_if_no_rim_is_wide_enough_the_whole_image_is_deconvolved(image: Image, psf: Psf) -> None:
     result, expected, alone = both(image, psf, "richardson-lucy", HOLE, largest_error=1e-9)
     assert alone.rim == Box(0, 256, 0, 224)
     assert result.of_box.error == 0
@@ -157,15 +151,13 @@ def test_the_quality_of_a_box_is_that_of_its_place_in_the_image(image: Image, ps
     assert quality[:, 0].all() and not quality[-1, -1] & QualityBit.EDGE
 
 
-def test_a_box_that_is_no_part_of_the_image_is_refused(image: Image, psf: Psf) -> None:
+def test_what_is_no_part_or_needs_the_whole_image_is_refused(image: Image, psf: Psf) -> None:
     for box in (Box(0, 257, 0, 20), Box(30, 20, 0, 20)):
         with pytest.raises(DataError, match=f"region-outside: .*{box}"):
             box_work(Work(image, psf, Options(method="linear")), box)
     with pytest.raises(DataError, match="region-too-small"):
         box_work(Work(image, psf, Options(method="linear")), Box(0, 20, 0, 15))
 
-
-def test_what_depends_on_the_whole_image_is_refused(image: Image, psf: Psf) -> None:
     def refused(largest_error: float = 0.05, changed: Image = image, **parameters: Any) -> str:
         with pytest.raises(DataError) as error:
             options = Options(method="linear", parameters=parameters, region_error=largest_error)

@@ -158,15 +158,14 @@ def test_a_parabola_focuses_at_half_its_radius() -> None:
     np.testing.assert_allclose(np.abs(image) ** 2, expected, atol=1e-4 * expected.max())
 
 
-def test_a_mesh_is_open_in_its_windows() -> None:
+def test_a_mesh_is_open_in_its_windows_for_any_samples(
+    path: LightPath,
+) -> None:
     grid = Grid("g", 1270, 0.01, LAMBDA_MM)  # ten pitches
     still, moved = (open_share(grid, mesh_openings_mm(HRI.meshes[0], phase, 20.0)) for phase in (0.0, 0.5))
     assert still.mean() == pytest.approx(1.23 / 1.27, rel=1e-12)
     assert still[635] == pytest.approx(1, abs=1e-9), "at phase 0 a window is on the axis"
     assert moved[635] == pytest.approx(0, abs=1e-9), "at phase 0.5 a wire is"
-
-
-def test_the_open_length_does_not_depend_on_the_samples(path: LightPath) -> None:
     ring = replace(path, aperture=Aperture(diameter_mm=47.4, obscuration_diameter_mm=9.1))
     windows = mesh_openings_mm(HRI.meshes[0], 0.21, 47.4)
     both = common_openings_mm(ring.aperture_mm, windows)
@@ -238,7 +237,7 @@ def test_a_telescope_of_parabolas_matches_the_closed_form(path: LightPath) -> No
     np.testing.assert_allclose(np.abs(after[points]), plain, atol=0.003 * plain.max())
 
 
-def test_best_focus_is_where_rays_meet(focus: BestFocus) -> None:
+def test_best_focus_is_where_rays_meet_and_gives_fraunhofer(focus: BestFocus, path: LightPath) -> None:
     assert focus.separation_mm == pytest.approx(653.81, abs=0.01)
     assert focus.separation_mm == pytest.approx(focus.paraxial_separation_mm, abs=0.01)
     assert focus.shift_mm == pytest.approx(-1.89, abs=0.01)
@@ -249,10 +248,7 @@ def test_best_focus_is_where_rays_meet(focus: BestFocus) -> None:
     assert focus.focal_length_mm == pytest.approx(4187.0, rel=1e-3)
     assert focus.focal_length_from_orders_mm == pytest.approx(focus.focal_length_mm, rel=3e-4)
     assert focus.order_spacing_px == pytest.approx(5.73, abs=0.005)
-
-
-def test_the_ideal_slit_in_focus_matches_fraunhofer(path: LightPath, focus: BestFocus) -> None:
-    """The light of the open aperture outside the central pixel is 1 - integral of sinc^2."""
+    # The light of the open aperture outside the central pixel is 1 - integral of sinc^2.
     grid = path.detector_grid
     field = fraunhofer_field(path.aperture_mm, grid, focus.focal_length_mm)
     line = binned_light(field, grid, 16)
@@ -263,7 +259,7 @@ def test_the_ideal_slit_in_focus_matches_fraunhofer(path: LightPath, focus: Best
 # --- the study ---
 
 
-def test_the_methods_agree_within_a_percentage_point(study: FresnelStudy, tmp_path: Path) -> None:
+def test_the_methods_agree_and_the_sampling_loses_no_light(study: FresnelStudy, tmp_path: Path) -> None:
     """The mesh moved to the left gives the same as moved to the right. The study is plotted."""
     (result,) = study.distances
     assert result.largest_points < 0.6
@@ -274,9 +270,6 @@ def test_the_methods_agree_within_a_percentage_point(study: FresnelStudy, tmp_pa
     assert result.phase_largest_points[1] == pytest.approx(result.phase_largest_points[3], abs=1e-6)
     fresnel_png(study, tmp_path / "f.png")
     assert matplotlib.image.imread(tmp_path / "f.png").std() > 0.05
-
-
-def test_the_sampling_is_reported_and_loses_no_light(study: FresnelStudy) -> None:
     planes = {plane.plane: plane for plane in study.distances[0].sampling}
     assert list(planes) == ["aperture", "primary", "secondary", "filter wheel", "detector"]
     assert planes["aperture"].least_samples == pytest.approx(47.4 * 66 / (LAMBDA_MM * 655.9), rel=1e-5)
@@ -314,20 +307,7 @@ def test_more_windows_bring_the_series_closer() -> None:
         assert len(result["phase_largest_points"]) == 2
 
 
-def test_the_error_names_the_key_that_an_instrument_lacks() -> None:
-    tilted = (replace(HRI.meshes[0], angle_deg=45.0), HRI.meshes[1])
-    for changes, key in (
-        ({"mirrors": ()}, "mirrors: expected a primary and a secondary"),
-        ({"mirrors": HRI.mirrors[:1]}, "mirrors"),
-        ({"distances": None}, "distances"),
-        ({"meshes": HRI.meshes[:1]}, "meshes: expected one mesh at place 'filter_wheel'; got 0"),
-        ({"meshes": tilted}, "angle_deg"),
-    ):
-        with pytest.raises(DataError, match=f"bad-instrument-file: hri_euv: .*{key}"):
-            fresnel_study(replace(HRI, **changes))
-
-
-def test_bad_requests_are_refused_before_the_work() -> None:
+def test_bad_requests_are_refused_before_the_work_and_a_missing_key_is_named() -> None:
     reported: list[int] = []
     for code, options in (
         ("bad-distance", {"distances_mm": (273.0, 580.0)}),
@@ -345,6 +325,16 @@ def test_bad_requests_are_refused_before_the_work() -> None:
     blind = replace(light_path(HRI), secondary=secondary, secondary_to_detector_mm=128.5)
     with pytest.raises(DataError, match="no-focus"):
         paraxial_separation_mm(blind)
+    tilted = (replace(HRI.meshes[0], angle_deg=45.0), HRI.meshes[1])
+    for changes, key in (
+        ({"mirrors": ()}, "mirrors: expected a primary and a secondary"),
+        ({"mirrors": HRI.mirrors[:1]}, "mirrors"),
+        ({"distances": None}, "distances"),
+        ({"meshes": HRI.meshes[:1]}, "meshes: expected one mesh at place 'filter_wheel'; got 0"),
+        ({"meshes": tilted}, "angle_deg"),
+    ):
+        with pytest.raises(DataError, match=f"bad-instrument-file: hri_euv: .*{key}"):
+            fresnel_study(replace(HRI, **changes))
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -67,13 +68,18 @@ def published(name: str, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], f
     return light, windows * spacing_px / open_share
 
 
-def test_orders_lie_at_multiples_of_the_spacing() -> None:
+def test_orders_lie_at_multiples_of_the_spacing_and_rotate_from_x_towards_y() -> None:
     assert [hri_spacing_px(mesh) for mesh in HRI.meshes] == pytest.approx([5.7365, 0.374], abs=0.001)
     pattern = line_of("hri entrance", 2048)[1024:]
     for order in range(1, 20):
         near = round(order * ENTRANCE_PX)
         assert pattern[near - 2 : near + 3].argmax() == 2
     assert line_of("hri filter wheel", 2048)[1024] ** 2 == pytest.approx(0.936, abs=0.001)
+    kernel = rotated("aia", 20.0, 129)
+    for order in (1, 2, 3):
+        along = order * AIA_PX
+        x, y = along * np.cos(np.deg2rad(20)), along * np.sin(np.deg2rad(20))
+        assert kernel[64 + round(y), 64 + round(x)] > 100 * kernel[64 - round(y), 64 + round(x)]
 
 
 def test_the_exact_integral_equals_fine_sampling_of_the_published_formula() -> None:
@@ -96,29 +102,18 @@ def test_without_rotation_the_pattern_is_the_product_of_exact_lines() -> None:
         assert found.sum() == pytest.approx(exact.sum(), abs=1e-5), name
 
 
-def test_rotation_moves_no_light_to_other_radii() -> None:
+def test_symmetries_of_a_square_and_light_that_stays_at_its_radius() -> None:
+    kernel = rotated("hri entrance", 17.0, 129)
+    np.testing.assert_allclose(kernel, kernel[::-1, ::-1], atol=1e-12)
+    np.testing.assert_allclose(kernel, np.rot90(kernel), atol=1e-12)
+    np.testing.assert_allclose(rotated("hri entrance", 107.0, 129), kernel, atol=1e-12)
+    np.testing.assert_allclose(rotated("hri entrance", -17.0, 129), kernel[::-1], atol=2e-5)
     radii = [0.5, 20.3, 60.7, 100.0]
     straight = cumulative_curve(rotated("aia", 0.0, 256), radii)
     for angle_deg in (1.3, 30.0, 45.0, -50.4):
         turned = cumulative_curve(rotated("aia", angle_deg, 256), radii)
         # An order near a radius may fall into a pixel on its other side; a far order holds some 0.1 % of the light.
         np.testing.assert_allclose(turned, straight, atol=0.35, err_msg=f"{angle_deg}")
-
-
-def test_the_pattern_has_the_symmetries_of_a_square() -> None:
-    kernel = rotated("hri entrance", 17.0, 129)
-    np.testing.assert_allclose(kernel, kernel[::-1, ::-1], atol=1e-12)
-    np.testing.assert_allclose(kernel, np.rot90(kernel), atol=1e-12)
-    np.testing.assert_allclose(rotated("hri entrance", 107.0, 129), kernel, atol=1e-12)
-    np.testing.assert_allclose(rotated("hri entrance", -17.0, 129), kernel[::-1], atol=2e-5)
-
-
-def test_the_pattern_rotates_from_x_towards_y() -> None:
-    kernel = rotated("aia", 20.0, 129)
-    for order in (1, 2, 3):
-        along = order * AIA_PX
-        x, y = along * np.cos(np.deg2rad(20)), along * np.sin(np.deg2rad(20))
-        assert kernel[64 + round(y), 64 + round(x)] > 100 * kernel[64 - round(y), 64 + round(x)]
 
 
 HEXAGONAL_PX = AIA_PX * 362.857 / 350.0
@@ -176,11 +171,8 @@ SIZE = 1024
 
 
 @pytest.fixture(scope="module")
-def aiapy(shared: Path) -> NDArray[np.float64]:
-    path = shared / "data" / "real" / "psf" / "derived_aia171_psf_aiapy0.10.2.fits"
-    if not path.exists():
-        pytest.skip(f"real data not available: {path}")
-    whole = np.asarray(fits.getdata(path), dtype=np.float64)
+def aiapy(real: Callable[[str], Path]) -> NDArray[np.float64]:
+    whole = np.asarray(fits.getdata(real("psf/derived_aia171_psf_aiapy0.10.2.fits")), dtype=np.float64)
     half = whole.shape[0] // 2
     return whole[half - SIZE // 2 : half + SIZE // 2, half - SIZE // 2 : half + SIZE // 2]
 
@@ -222,23 +214,16 @@ def arms_by_centroid(kernel: NDArray[np.float64], spacing_px: float) -> list[tup
     return found
 
 
-def test_aia_arms_agree_with_aiapy(aiapy: NDArray[np.float64], ours: NDArray[np.float64]) -> None:
+def test_aia_arms_and_light_agree_with_aiapy(aiapy: NDArray[np.float64], ours: NDArray[np.float64]) -> None:
     theirs, found = arms_by_centroid(aiapy, 16.26), arms_by_centroid(ours, 16.26)
     for (their_angle, their_spacing), (angle, spacing) in zip(theirs, found, strict=True):
         # The file has one angle per mesh; the measured arms differ from 90 degrees by 0.06 and 0.05 degrees.
         assert angle == pytest.approx(their_angle, abs=0.06)
         assert their_spacing == pytest.approx(16.26, abs=0.01)
         assert spacing == pytest.approx(16.26, abs=0.02)
-
-
-def test_aia_light_beyond_a_radius_agrees_with_aiapy(
-    aiapy: NDArray[np.float64], ours: NDArray[np.float64]
-) -> None:
-    """18.4 % lie beyond 10.75 px. Both keep 0.82 in order zero and give each arm the same light.
-
-    aiapy stops at order 100 and has no orders off the axes (0.9 % of the light here), so it has less light
-    far out. Its core is a Gaussian of 0.47 px, so it has less light in the central pixel.
-    """
+    # 18.4 % lie beyond 10.75 px. Both keep 0.82 in order zero and give each arm the same light.
+    # aiapy stops at order 100 and has no orders off the axes (0.9 % of the light here), so it has less light
+    # far out. Its core is a Gaussian of 0.47 px, so it has less light in the central pixel.
     theirs = dict(zip((0.5, 1.5, 10.75, 100), cumulative_curve(aiapy, [0.5, 1.5, 10.75, 100]), strict=True))
     found = dict(zip((0.5, 1.5, 10.75, 100), cumulative_curve(ours, [0.5, 1.5, 10.75, 100]), strict=True))
     assert theirs[10.75] == pytest.approx(18.43, abs=0.05)

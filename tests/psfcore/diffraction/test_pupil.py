@@ -82,13 +82,10 @@ def test_sectors_and_polygons_are_the_points_inside_them() -> None:
     assert np.abs(found - by_points(polygon, len(found), 0.1)).mean() < 2e-4
 
 
-def test_the_open_area_with_wires_is_right_to_1e_5() -> None:
+def test_meshes_have_the_right_open_area_with_a_window_or_a_wire_on_the_axis() -> None:
     """Full windows in a square opening, with cells that are no fraction of pitch or wire."""
     square = Pupil((bar(-4.5, 4.5, 9.0, 0.0),), meshes=(mesh(),))
     assert area_mm2(square, 0.0337) == pytest.approx(81 * 0.93**2, rel=1e-5)
-
-
-def test_an_odd_number_of_windows_has_one_on_the_axis_and_an_even_number_a_wire() -> None:
     odd, even = (mask(Pupil((bar(-4, 4, 8.0, 0.0),), meshes=(mesh(windows=n),))) for n in (9, 8))
     centre = len(odd) // 2
     assert odd[centre - 9 : centre + 9, centre - 9 : centre + 9].min() == 1
@@ -152,13 +149,10 @@ def image_mount(width_mm: float = 10.0) -> Mount:
 UNFIT = [
     (image_mount(), None, "mask_image"),
     (image_mount(), np.ones((4, 5)), "mask_image"),
-    (image_mount(), np.ones(16), "mask_image"),
-    (image_mount(), np.ones((3, 3, 3)), "mask_image"),
     (image_mount(), np.zeros((4, 4)), "mask_image"),
     (image_mount(), np.full((4, 4), np.nan), "mask_image"),
     (image_mount(9.0), np.ones((4, 4)), "mask_image.width_mm"),
     (Mount(basis="assumed", rings=(Ring(radius_mm=4.9, width_mm=0.4),)), None, "rings.0"),
-    (Mount(basis="assumed", rings=(Ring(radius_mm=0.1, width_mm=0.4),)), None, "rings.0"),
     (Mount(basis="assumed", hub_diameter_mm=11.0), None, "hub_diameter_mm"),
     (Mount(basis="assumed", rays=(Rays(count=2, width_mm=10.0),)), None, "rays.0.width_mm"),
 ]

@@ -42,7 +42,7 @@ def lightness(levels: np.ndarray) -> np.ndarray:
     return np.where(y > (6 / 29) ** 3, 116 * np.cbrt(y) - 16, y * (29 / 3) ** 3)
 
 
-def test_a_brighter_level_is_lighter() -> None:
+def test_a_brighter_level_is_lighter_and_all_are_those_of_the_plots() -> None:
     white_grey_black = np.array([[255, 255, 255], [119, 119, 119], [0, 0, 0]])
     assert lightness(white_grey_black) == pytest.approx([100.0, 50.0, 0.0], abs=0.1)
     for count in (256, 255):
@@ -50,20 +50,14 @@ def test_a_brighter_level_is_lighter() -> None:
         assert levels.shape == (count, 3) and levels.dtype == np.uint8
         assert np.diff(lightness(levels)).min() > 0
         assert lightness(levels)[[0, -1]] == pytest.approx([0, 99], abs=1)
-
-
-def test_the_levels_pass_through_the_control_points_and_are_the_map_of_the_plots() -> None:
+    red, _, blue = rgb(NO_DATA)
+    assert blue > red and (euv_levels()[:, 0] >= euv_levels()[:, 2]).all()
     levels = euv_levels(1001)
     assert [tuple(levels[round(share * 1000)]) for share, _ in EUV_POINTS] == [
         rgb(colour) for _, colour in EUV_POINTS
     ]
     drawn = GOLD(np.arange(256), bytes=True)[:, :3].astype(int)
     assert np.abs(drawn - euv_levels()).max() <= 1  # Matplotlib rounds otherwise
-
-
-def test_no_level_looks_like_a_pixel_without_data() -> None:
-    red, _, blue = rgb(NO_DATA)
-    assert blue > red and (euv_levels()[:, 0] >= euv_levels()[:, 2]).all()
 
 
 # --- units -----------------------------------------------------------------------------------------------
@@ -117,7 +111,7 @@ def test_pixels_are_means_of_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     assert reduced(np.ones((2, 5000))).shape == (1, 24), "a very long image keeps a row"
 
 
-def test_the_stretch_is_asinh() -> None:
+def test_the_stretch_is_asinh_and_logarithmic_for_the_weights_of_a_psf(tmp_path: Path) -> None:
     pixels = np.linspace(-10.0, 100.0, 10_001).reshape(73, 137)
     levels = levels_of(pixels).astype(int)
     top = np.percentile(pixels, 99.7)
@@ -126,6 +120,12 @@ def test_the_stretch_is_asinh() -> None:
     assert levels.min() == 0 and levels.max() == 254
     for value in (0.0, -3.0):
         assert not levels_of(np.full((5, 4), value)).any(), "an image without light is black"
+    weights = np.array([[0.1, 0.1 * 10 ** (-DECADES / 2)], [0.0, -1.0]])
+    (tmp_path / "psf.png").write_bytes(png_of_weights(weights))
+    picture = np.round(imread(tmp_path / "psf.png")[::-1, :, :3] * 255)
+    levels = euv_levels(255)
+    assert (picture[0] == [levels[-1], levels[127]]).all() and (picture[1] == levels[0]).all()
+    assert png_of_weights(np.zeros((2, 2))), "no weight is no error"
 
 
 def test_the_picture_has_row_0_at_the_bottom_and_marks_pixels_without_data(tmp_path: Path) -> None:
@@ -146,15 +146,6 @@ def test_the_picture_has_row_0_at_the_bottom_and_marks_pixels_without_data(tmp_p
     assert picture.shape == (192, 192, 3) and (picture == rgb(NO_DATA)).all()
 
 
-def test_the_weights_of_a_psf_have_a_logarithmic_stretch(tmp_path: Path) -> None:
-    weights = np.array([[0.1, 0.1 * 10 ** (-DECADES / 2)], [0.0, -1.0]])
-    (tmp_path / "psf.png").write_bytes(png_of_weights(weights))
-    picture = np.round(imread(tmp_path / "psf.png")[::-1, :, :3] * 255)
-    levels = euv_levels(255)
-    assert (picture[0] == [levels[-1], levels[127]]).all() and (picture[1] == levels[0]).all()
-    assert png_of_weights(np.zeros((2, 2))), "no weight is no error"
-
-
 # --- plots -----------------------------------------------------------------------------------------------
 
 
@@ -164,7 +155,7 @@ def colour_at(path: Path, x: float, y: float) -> np.ndarray:
     return np.asarray(picture[int(y * picture.shape[0]), int(x * picture.shape[1]), :3])
 
 
-def test_the_change_panel_is_red_for_more_light_and_blue_for_less(tmp_path: Path) -> None:
+def test_the_panels_before_after_and_of_the_change(tmp_path: Path) -> None:
     before = np.full((128, 128), 100.0)
     after = before.copy()
     after[:, :64] = 180.0
@@ -173,16 +164,10 @@ def test_the_change_panel_is_red_for_more_light_and_blue_for_less(tmp_path: Path
     gained, lost = (colour_at(tmp_path / "p.png", x, 0.5) for x in (0.72, 0.90))
     assert gained[0] > 0.6 > gained[2]
     assert lost[2] > lost[0]
-
-
-def test_before_and_after_use_the_same_stretch(tmp_path: Path) -> None:
     plane = np.random.default_rng(0).random((64, 64)) + 1
     preview_png(plane, plane, tmp_path / "p.png", title="same", unit="DN")
     left, right = (colour_at(tmp_path / "p.png", x, 0.5) for x in (0.1, 0.1 + 0.318))
     np.testing.assert_allclose(left, right, atol=0.02)
-
-
-def test_any_shape_and_missing_pixels_are_drawn(tmp_path: Path) -> None:
     for shape in ((16, 16), (33, 900)):
         before = np.ones(shape)
         before[0, 0], before[1, 1] = np.nan, -4.0

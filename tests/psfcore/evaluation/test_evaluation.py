@@ -38,7 +38,7 @@ from tests.psfcore.small_transits import (
 )
 
 
-def test_the_true_psf_leaves_no_residual() -> None:
+def test_a_wrong_psf_leaves_the_residual_of_an_exact_inverse() -> None:
     found = judged()
     assert len(found.frames) == IMAGES and not found.left_out
     assert max(abs(f.residual_pct) for f in found.frames) < 0.01
@@ -46,10 +46,7 @@ def test_the_true_psf_leaves_no_residual() -> None:
     assert found.superposed.mape_mean_pct < 0.01
     for n, frame in enumerate(found.frames):
         assert residual_against_pct(frame, sky().noise_free[n]) == pytest.approx(frame.residual_pct, abs=1e-4)
-
-
-def test_a_wrong_psf_leaves_the_residual_of_an_exact_inverse() -> None:
-    """Compared with a double-precision inverse: invert, set the disc to zero, convolve."""
+    # Compared with a double-precision inverse: invert, set the disc to zero, convolve.
     for total, n in ((1.1 * SCATTER.total, 0), (0.0, 5)):
         found = judged(total)
         through = Convolver(kernel_with(total), (SIZE_PX, SIZE_PX), dtype=np.float64)
@@ -68,13 +65,6 @@ def test_it_agrees_with_the_residuals_of_the_inversion() -> None:
         assert here.residual_pct == pytest.approx(there.residual_pct, abs=0.03)
         assert here.noise_dn_s == pytest.approx(there.noise, rel=1e-3)
         assert here.observed_dn_s == pytest.approx(there.observed, rel=1e-4)
-
-
-def test_threads_change_nothing() -> None:
-    one, two = judged(), evaluate(noise_free(sky()), lambda _: kernel_with(), threads=2)
-    for a, b in zip(one.frames, two.frames, strict=True):
-        np.testing.assert_array_equal(a.simulated, b.simulated)
-    np.testing.assert_array_equal(one.superposed.noise_mape_pct, two.superposed.noise_mape_pct)
 
 
 def test_residuals_scatter_by_their_stated_noise() -> None:

@@ -13,7 +13,6 @@ import pytest
 from psfcore.errors import DataError
 from psfcore.evaluation import shapes
 from psfcore.evaluation.evaluation import evaluate
-from psfcore.evaluation.report import report
 from psfcore.evaluation.shapes import (
     FIGURES,
     FREE_SHELLS,
@@ -22,9 +21,9 @@ from psfcore.evaluation.shapes import (
     compare_shapes_by_errors,
     held_out_kernels,
 )
-from psfcore.evaluation.summary_lines import summary_lines
 from psfcore.scatter.inversion import invert
 from psfcore.scatter.shapes import SHAPES
+from psfcore.scatter.validation.cross_validation import FoldSample, shared_step
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.scatter_truth import ScatterTruth
 from psfcore.simulate.transit import simulate
@@ -55,6 +54,14 @@ def test_all_shapes_are_compared_on_the_same_images() -> None:
     for name in FIGURES:
         difference = second.figures[name][0] - first.figures[name][0]
         assert second.minus_first[name][0] == pytest.approx(difference, abs=1e-9)
+    # Those of the power law agree with the superposed maps of its held-out PSFs.
+    looked = evaluate(solved().transit, held_out_kernels(solved()), noise_realisations=0)
+    figures = compared().shapes[0].figures
+    residual = np.array([frame.residual_pct for frame in looked.frames])
+    assert figures["residual_mean_pct"][0] == pytest.approx(residual.mean())
+    assert figures["residual_rms_pct"][0] == pytest.approx(np.sqrt((residual**2).mean()))
+    assert figures["mpe_rms_pct"][0] == pytest.approx(looked.superposed.mpe_rms_pct)
+    assert figures["mape_mean_pct"][0] == pytest.approx(looked.superposed.mape_mean_pct)
 
 
 @pytest.mark.slow
@@ -78,17 +85,6 @@ def test_shapes_do_not_differ_where_the_truth_is_isotropic() -> None:
             assert sigma < shape.figures[name][1]  # the same images: better known than the figures themselves
 
 
-def test_figures_are_those_of_the_evaluation() -> None:
-    """Those of the power law agree with the superposed maps of its held-out PSFs."""
-    looked = evaluate(solved().transit, held_out_kernels(solved()), noise_realisations=0)
-    figures = compared().shapes[0].figures
-    residual = np.array([frame.residual_pct for frame in looked.frames])
-    assert figures["residual_mean_pct"][0] == pytest.approx(residual.mean())
-    assert figures["residual_rms_pct"][0] == pytest.approx(np.sqrt((residual**2).mean()))
-    assert figures["mpe_rms_pct"][0] == pytest.approx(looked.superposed.mpe_rms_pct)
-    assert figures["mape_mean_pct"][0] == pytest.approx(looked.superposed.mape_mean_pct)
-
-
 def test_other_shapes_and_few_images_are_refused() -> None:
     knee = dataclasses.replace(solved().inversion, shape=SHAPES["knee"])
     with pytest.raises(DataError, match=r"unknown-shape.*softened-power-law.*knee"):
@@ -105,6 +101,10 @@ def test_every_image_has_the_psf_of_the_fold_that_holds_it_out() -> None:
     assert len(parts) == 4
     of_fold = [kernels(fold.held_out[0]) for fold in parts]
     assert len({id(kernel) for kernel in of_fold}) == 4
+    counts = tuple(int(n in parts[1].fitted) for n in range(IMAGES))
+    step = shared_step(solved(), FoldSample(0, 1, counts, parts[1].held_out))
+    expected = solved().total.kernel(solved().inversion.coordinates + step)
+    np.testing.assert_array_equal(of_fold[1], expected)
     for fold, kernel in zip(parts, of_fold, strict=True):
         assert all(kernels(n) is kernel for n in fold.held_out)
     found = evaluate(observed(sky()).transit, kernels)
@@ -123,16 +123,13 @@ def test_held_out_discs_of_clean_transits_are_predicted() -> None:
     for seed in (0, 1, 2):
         made = simulate(default_plan(30, 512), drawn_truth(seed), hri_diffraction(1024), seed)
         found = evaluate(made.transit, held_out_kernels(invert(made.transit)))
-        print("\n".join(["", f"seed {seed}", *summary_lines(report(found))]))
         for fov in off:
             planes = made.sky.noise_free
             here = [residual_against_pct(f, planes[f.index]) for f in found.frames if f.pointing == fov]
-            print(f"pointing {fov}, discs without noise: mean {np.mean(here):+.2f} %, rms {rms(here):.2f} %")
             assert abs(np.mean(here)) < 1.5 and rms(here) < 2
             off[fov] += here
         maps = found.superposed
         assert maps.mape_mean_pct == pytest.approx(maps.mape_noise_mean_pct, rel=0.05)
         assert maps.mpe_rms_pct == pytest.approx(maps.mpe_noise_rms_pct, rel=0.15)
-    for fov, values in off.items():
-        print(f"pointing {fov} of three transits: mean {np.mean(values):+.2f} %, rms {rms(values):.2f} %")
+    for values in off.values():
         assert abs(np.mean(values)) < 1 and rms(values) < 2

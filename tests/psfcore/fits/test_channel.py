@@ -8,11 +8,10 @@ import pytest
 from astropy.io import fits
 
 from psfcore.errors import DataError
-from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.channel import channel_differences, check_channel
 from psfcore.fits.psfs import read_psf, write_psf
 from psfcore.psf import Psf
-from tests.psfcore.conftest import gaussian, make_psf
+from tests.psfcore.conftest import LIMITS, gaussian, make_psf
 
 AIA = {"TELESCOP": "SDO/AIA", "INSTRUME": "AIA_3", "WAVELNTH": 171, "WAVEUNIT": "angstrom"}
 HRI = {"TELESCOP": "SOLO/EUI/HRI_EUV", "INSTRUME": "EUI", "DETECTOR": "HRI_EUV", "WAVELNTH": 174}
@@ -23,6 +22,8 @@ def psf_with(**changes: object) -> Psf:
 
 
 AIA_171 = psf_with(name="aia_171", instrument="aia_171", wavelength_angstrom=171.07)
+EUVI = {"TELESCOP": "STEREO", "INSTRUME": "SECCHI", "DETECTOR": "EUVI", "WAVELNTH": 171}
+XRT = {"TELESCOP": "HINODE", "INSTRUME": "XRT", "WAVELNTH": 171}
 HRI_EUV = psf_with(name="hri_euv", instrument="hri_euv", wavelength_angstrom=174.0)
 
 
@@ -36,6 +37,19 @@ def test_a_psf_of_the_images_channel_is_taken_in_silence() -> None:
         (psf_with(wavelength_angstrom=171.0, cards={"INSTRUME": "AIA", "FILTER": "THIN"}), AIA),
     ):
         assert check_channel(psf, fits.Header(cards)) is None, (psf.name, cards)
+    # The closest pair of channels in use, 193 (AIA) and 195 (EIT), is 1.03 % apart.
+    eit = psf_with(wavelength_angstrom=195.0)
+    assert channel_differences(eit, fits.Header({"WAVELNTH": 193}))
+    assert not channel_differences(eit, fits.Header({"WAVELNTH": 195.12}))
+    assert not channel_differences(psf_with(wavelength_angstrom=303.78), fits.Header({"WAVELNTH": 304}))
+    for psf, cards, silent in (
+        (psf_with(), AIA, "PSF without"),
+        (AIA_171, {"TELESCOP": "SDO/AIA"}, "image without"),
+        (psf_with(), {}, "PSF and image without"),
+        (AIA_171, {"WAVELNTH": 171, "WAVEUNIT": "furlong"}, "image without"),
+    ):
+        warning = check_channel(psf, fits.Header(cards))
+        assert warning is not None and silent in warning
 
 
 OTHER_CHANNELS = [
@@ -52,6 +66,8 @@ OTHER_CHANNELS = [
         {**HRI, "FILTER": "Al_174_2"},
         "FILTER",
     ),
+    (psf_with(cards={"OBSRVTRY": "STEREO_A"}), {**EUVI, "OBSRVTRY": "STEREO_B"}, "STEREO_B"),
+    (psf_with(cards={"EC_FW1_": "Be_thin"}), {**XRT, "EC_FW1_": "Al_poly"}, "EC_FW1_"),
 ]
 
 
@@ -63,32 +79,13 @@ def test_another_channel_is_refused_unless_told(subtests: pytest.Subtests) -> No
         assert warning is not None and named in warning and "another channel" in warning
 
 
-def test_what_cannot_be_compared_is_told() -> None:
-    for psf, cards, silent in (
-        (psf_with(), AIA, "PSF without"),
-        (AIA_171, {"TELESCOP": "SDO/AIA"}, "image without"),
-        (psf_with(), {}, "PSF and image without"),
-        (AIA_171, {"WAVELNTH": 171, "WAVEUNIT": "furlong"}, "image without"),
-    ):
-        warning = check_channel(psf, fits.Header(cards))
-        assert warning is not None and silent in warning
-
-
-def test_neighbouring_channels_differ_and_rounded_ones_do_not() -> None:
-    """The closest pair of channels in use, 193 (AIA) and 195 (EIT), is 1.03 % apart."""
-    eit = psf_with(wavelength_angstrom=195.0)
-    assert channel_differences(eit, fits.Header({"WAVELNTH": 193}))
-    assert not channel_differences(eit, fits.Header({"WAVELNTH": 195.12}))
-    assert not channel_differences(psf_with(wavelength_angstrom=303.78), fits.Header({"WAVELNTH": 304}))
-
-
-def test_a_psf_file_says_what_it_is_for(tmp_path: Path, limits: FitsLimits) -> None:
+def test_a_psf_file_says_what_it_is_for(tmp_path: Path) -> None:
     header = fits.Header({**AIA, "FILTER": "thin"})
     fits.PrimaryHDU(gaussian(32, 1.0).astype("f4"), header).writeto(tmp_path / "other.fits")
-    other = read_psf(tmp_path / "other.fits", limits)
+    other = read_psf(tmp_path / "other.fits", LIMITS)
     assert other.cards == {"TELESCOP": "SDO/AIA", "INSTRUME": "AIA_3", "FILTER": "thin"}
     assert other.wavelength_angstrom == 171.0
     write_psf(tmp_path / "own.fits", AIA_171)
-    own = read_psf(tmp_path / "own.fits", limits)
+    own = read_psf(tmp_path / "own.fits", LIMITS)
     assert own.cards == {} and own.instrument == "aia_171", "INSTRUME is the name of the instrument file here"
     assert check_channel(own, fits.Header(AIA)) is None

@@ -60,10 +60,8 @@ BAD_CARDS = {
     "a heap that starts in the rows": compressed(THEAP=8),
     "a heap that starts after the data": compressed(THEAP=8 * 16 + 101),
     "BYTEPIX 8": codec_settings(BLOCKSIZE=32, BYTEPIX=8),
-    "BYTEPIX 3": codec_settings(BYTEPIX=3),
     "BYTEPIX 4 of pixels of 2 bytes": codec_settings(BYTEPIX=4),
     "BYTEPIX of text": codec_settings(BYTEPIX="'2'"),
-    "BYTEPIX 2.0": codec_settings(BYTEPIX="2.0"),
     "BYTEPIX in small letters": codec_settings(bytepix=8),
     "BYTEPIX twice": compressed(ZNAME1="'BYTEPIX'", ZVAL1=2, ZNAME2="'BYTEPIX'", ZVAL2=8),
     "BLOCKSIZE 33": codec_settings(BLOCKSIZE=33, BYTEPIX=2),
@@ -174,24 +172,20 @@ def peak_mib_of_refusal(path: Path, code: str, *, psf: bool = False) -> float:
     return peak / MIB
 
 
-@pytest.mark.parametrize(("column", "packed"), [("COMPRESSED_DATA", False), ("GZIP_COMPRESSED_DATA", True)])
-def test_a_tenth_of_a_megabyte_that_inflates_to_100_uses_no_memory(
-    tmp_path: Path, column: str, packed: bool
-) -> None:
-    content = lying_tiles(gzip.compress(bytes(100_000_000)), column=column)
-    assert len(content) < 120_000
-    path = tmp_path / "bomb.fits"
-    path.write_bytes(gzip.compress(content) if packed else content)
-    assert peak_mib_of_refusal(path, "unreadable-pixels") < 30
-
-
-def test_a_stream_that_is_too_long_for_its_tile_is_refused(tmp_path: Path) -> None:
-    """By a byte; or a stream of empty deflate blocks, which each of 64 descriptors would read, before it is inflated."""
-    nothing = gzip.compress(b"")
+def test_a_stream_too_long_for_its_tile_is_not_inflated(tmp_path: Path) -> None:
+    """By a hundred megabytes, by a byte, or by empty deflate blocks, which each of 64 descriptors would read."""
+    nothing, path = gzip.compress(b""), tmp_path / "bomb.fits"
     empty = nothing[:10] + bytes.fromhex("000000ffff") * 20_000 + nothing[10:]
-    for stream in (gzip.compress(bytes(64 * 8 + 1)), empty):
-        (tmp_path / "bomb.fits").write_bytes(lying_tiles(stream))
-        assert peak_mib_of_refusal(tmp_path / "bomb.fits", "unreadable-pixels") < 10
+    large = gzip.compress(bytes(100_000_000))
+    packed = gzip.compress(lying_tiles(large, column="GZIP_COMPRESSED_DATA"))
+    for content, most_mib in (
+        (lying_tiles(large), 30),
+        (packed, 30),
+        (lying_tiles(gzip.compress(bytes(64 * 8 + 1))), 10),
+        (lying_tiles(empty), 10),
+    ):
+        path.write_bytes(content)
+        assert len(content) < 120_000 and peak_mib_of_refusal(path, "unreadable-pixels") < most_mib
 
 
 def first_row(path: Path) -> int:
@@ -207,7 +201,7 @@ def with_first_length(path: Path, change: Callable[[int], int]) -> None:
     path.write_bytes(content)
 
 
-def test_a_stream_of_rice_that_ends_too_early_is_refused(tmp_path: Path) -> None:
+def test_streams_of_rice_that_end_too_early_or_do_not_end_are_refused(tmp_path: Path) -> None:
     """Cut anywhere, for each width of a pixel: astropy's encoder writes no byte that the decoder does not read."""
     rows = {
         "constant": np.full(100, 7),
@@ -223,10 +217,7 @@ def test_a_stream_of_rice_that_ends_too_early_is_refused(tmp_path: Path) -> None
         with_first_length(path, lambda length, cut=cuts[number % 4]: max(cut(length), 1))
         with pytest.raises(DataError, match=r"unreadable-pixels"):
             read_observation(path, LIMITS)
-
-
-def test_zeros_to_the_end_of_a_stream_of_rice_are_not_followed_past_it(tmp_path: Path) -> None:
-    """The code of the first block is 1: a difference is a number of zeros and a one. There is no one."""
+    # The code of the first block is 1: a difference is a number of zeros and a one. There is no one.
     pixels = RNG.integers(0, 9999, (20, 100)).astype("i2")
     path = written(tmp_path / "t.fits", pixels, compression_type="RICE_1", tile_shape=(20, 100))
     heap, content = first_row(path) + 8, path.read_bytes()
@@ -258,9 +249,6 @@ def test_correct_tiles_pass(tmp_path: Path) -> None:
         path = written(tmp_path / "tiles.fits", pixels, **options)
         assert read_summary(path, LIMITS).codec == codec
         assert np.array_equal(read_observation(path, LIMITS).pixels, pixels), (codec, dtype, tile)
-
-
-def test_quantised_floats_pass_with_tiles_that_could_not_be_quantised(tmp_path: Path) -> None:
     pixels = RNG.normal(100, 1, (40, 50)).astype("f4")
     pixels[3] *= 1e27  # stored in GZIP_COMPRESSED_DATA
     for codec in ("RICE_1", "GZIP_1", "GZIP_2"):
@@ -268,18 +256,14 @@ def test_quantised_floats_pass_with_tiles_that_could_not_be_quantised(tmp_path: 
         assert np.allclose(read_observation(path, LIMITS).pixels, pixels, rtol=0.01), codec
 
 
-@pytest.mark.parametrize(
-    ("tail", "code"),
-    [("many HDUs", "too-many-hdus"), ("long header", "header-too-long"), ("inflated data", "too-many-bytes")],
-)
-def test_hdus_after_the_kernel_of_a_psf_obey_the_limits(tmp_path: Path, tail: str, code: str) -> None:
-    path = tmp_path / "psf.fits"
-    path.write_bytes(psf_with_a_tail(tail))
-    read_psf(path, LIMITS, parts=False)  # a convolution does not read them
-    assert peak_mib_of_refusal(path, code, psf=True) < 60
+TAILS = {"many HDUs": "too-many-hdus", "long header": "header-too-long", "inflated data": "too-many-bytes"}
 
 
-def test_a_compressed_component_is_not_inflated(tmp_path: Path) -> None:
+def test_hdus_after_the_kernel_of_a_psf_obey_the_limits(tmp_path: Path) -> None:
     path = tmp_path / "psf.fits"
+    for tail, code in TAILS.items():
+        path.write_bytes(psf_with_a_tail(tail))
+        read_psf(path, LIMITS, parts=False)  # a convolution does not read them
+        assert peak_mib_of_refusal(path, code, psf=True) < 60, tail
     path.write_bytes(psf_with_a_tail("component of tiles"))
-    assert read_psf(path, LIMITS).components == {}
+    assert read_psf(path, LIMITS).components == {}, "a compressed component is not inflated"

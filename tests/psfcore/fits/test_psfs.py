@@ -15,7 +15,6 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError
-from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.header import read_summary
 from psfcore.fits.psfs import read_psf, write_psf
 from psfcore.fits.stored_psf import check_is_psf, cutout
@@ -24,10 +23,9 @@ from psfcore.psf import REACH_GRID_PX, Psf
 from psfcore.scatter.power_law import scatter_kernel
 from tests.conftest import write_image
 from tests.conftest import write_psf as write_example
-from tests.psfcore.conftest import delta, gaussian, make_psf
+from tests.psfcore.conftest import LIMITS, delta, gaussian, make_psf
 
 Find = Callable[[str], Path]
-LIMITS = FitsLimits(max_pixels=2**24)
 
 
 def save(path: Path, data: NDArray[np.generic]) -> Path:
@@ -49,20 +47,24 @@ def full_psf() -> Psf:
     )
 
 
-def test_a_psf_is_read_back_complete(tmp_path: Path, limits: FitsLimits) -> None:
+def test_a_psf_is_read_back_complete(tmp_path: Path) -> None:
     toml = instrument_path("hri_euv").read_bytes()
     psf = full_psf()
     for name in ("a.fits", "b.fits"):
         write_psf(tmp_path / name, psf, instrument_file=toml)
     assert (tmp_path / "a.fits").read_bytes() == (tmp_path / "b.fits").read_bytes()
-    back = read_psf(tmp_path / "a.fits", limits)
+    back = read_psf(tmp_path / "a.fits", LIMITS)
+    wide = make_psf(scatter_kernel(6.15, 2.53, 0.411, 2048))
+    write_psf(tmp_path / "wide.fits", wide)
+    single = read_psf(tmp_path / "wide.fits", LIMITS)
+    assert single.total == pytest.approx(wide.total, abs=1e-7), "single precision keeps the sum"
     assert (back.name, back.version, back.status, back.instrument) == ("mine", "3", "draft", "hri_euv")
     assert (back.plate_scale_arcsec, back.wavelength_angstrom) == (0.492, 174.0)
     np.testing.assert_array_equal(back.kernel, psf.kernel.astype(np.float32))
     assert list(back.components) == ["DIFFRACTION", "SCATTER"]
     assert back.provenance["instrument_toml"].encode() == toml
     assert "why: test" in back.provenance["history"]
-    assert read_summary(tmp_path / "a.fits", limits).shape == (64, 64)
+    assert read_summary(tmp_path / "a.fits", LIMITS).shape == (64, 64)
     with fits.open(tmp_path / "a.fits", checksum=True) as hdus:
         assert all(hdu.verify_checksum() == 1 for hdu in hdus)
         assert hdus["PROFILE"].data["cumulative_pct"][-1] == pytest.approx(10.0, abs=1e-3)
@@ -75,24 +77,18 @@ def test_a_psf_is_read_back_complete(tmp_path: Path, limits: FitsLimits) -> None
         assert (hdus[0].header["CRPIX1"], hdus[0].header["CRPIX2"]) == (33.0, 33.0)
 
 
-def test_single_precision_keeps_the_sum_of_the_full_psf(tmp_path: Path, limits: FitsLimits) -> None:
-    psf = make_psf(scatter_kernel(6.15, 2.53, 0.411, 2048))
-    write_psf(tmp_path / "p.fits", psf)
-    assert read_psf(tmp_path / "p.fits", limits).total == pytest.approx(psf.total, abs=1e-7)
-
-
-def test_a_psf_of_another_program_is_named_after_its_file(tmp_path: Path, limits: FitsLimits) -> None:
+def test_a_psf_of_another_program_is_named_after_its_file(tmp_path: Path) -> None:
     for shape in ((31, 31), (32, 32), (33, 48)):
         kernel = np.full(shape, 1e-6)
         kernel[shape[0] // 2, shape[1] // 2] = 0.9
         (tmp_path / f"{shape}").mkdir()
-        psf = read_psf(save(tmp_path / f"{shape}" / "other_psf.v2.fits", kernel), limits)
+        psf = read_psf(save(tmp_path / f"{shape}" / "other_psf.v2.fits", kernel), LIMITS)
         assert (psf.name, psf.status) == ("other_psf", "user")
         assert (psf.instrument, psf.plate_scale_arcsec) == (None, None)
 
 
-def test_a_real_psf_of_another_program(real: Find, limits: FitsLimits) -> None:
-    psf = read_psf(real("psf/derived_aia171_psf_aiapy0.10.2.fits"), limits)
+def test_a_real_psf_of_another_program(real: Find) -> None:
+    psf = read_psf(real("psf/derived_aia171_psf_aiapy0.10.2.fits"), LIMITS)
     assert psf.kernel.shape == (4096, 4096)
     assert psf.total == pytest.approx(1, abs=1e-6)
     assert psf.wavelength_angstrom == 171
@@ -107,11 +103,11 @@ def random_psf(path: Path, shape: tuple[int, int], kind: str) -> np.ndarray:
     return weights
 
 
-def test_the_pixels_are_those_of_the_centre(tmp_path: Path, limits: FitsLimits) -> None:
+def test_the_pixels_are_those_of_the_centre(tmp_path: Path) -> None:
     path = tmp_path / "psf.fits"
     for (ny, nx), kind, size in product([(64, 64), (63, 65), (7, 5)], ["f4", "f8"], [1, 2, 5]):
         weights = random_psf(path, (ny, nx), kind)
-        part = cutout(path, size, limits)
+        part = cutout(path, size, LIMITS)
         content = b"".join(part.pieces())
         assert len(content) == part.length and part.length % 2880 == 0
         top, left = ny // 2 - size // 2, nx // 2 - size // 2
@@ -122,24 +118,21 @@ def test_the_pixels_are_those_of_the_centre(tmp_path: Path, limits: FitsLimits) 
             assert hdus[0].header["PSFSUM"] == pytest.approx(float(expected.astype("f8").sum()), rel=1e-12)
 
 
-def test_a_whole_psf_is_cut_out_in_pieces(tmp_path: Path, limits: FitsLimits) -> None:
+def test_a_whole_psf_is_cut_out_in_pieces_and_never_padded(tmp_path: Path) -> None:
     """Sixteen mebibytes of pixels take less than two of memory."""
     random_psf(tmp_path / "psf.fits", (2048, 2048), "f4")
-    cutout(tmp_path / "psf.fits", 8, limits)  # what is imported now does not count
+    cutout(tmp_path / "psf.fits", 8, LIMITS)  # what is imported now does not count
     tracemalloc.start()
     try:
-        part = cutout(tmp_path / "psf.fits", 2048, limits)
+        part = cutout(tmp_path / "psf.fits", 2048, LIMITS)
         length = sum(map(len, part.pieces()))
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
     assert length == part.length == (tmp_path / "psf.fits").stat().st_size
     assert peak < 2 * 2**20
-
-
-def test_a_psf_that_was_cut_short_is_not_padded(tmp_path: Path, limits: FitsLimits) -> None:
     random_psf(tmp_path / "psf.fits", (64, 64), "f4")
-    part = cutout(tmp_path / "psf.fits", 64, limits)
+    part = cutout(tmp_path / "psf.fits", 64, LIMITS)
     content = (tmp_path / "psf.fits").read_bytes()
     (tmp_path / "psf.fits").write_bytes(content[:8000])
     with pytest.raises(EOFError, match="of row"):
@@ -195,14 +188,6 @@ def test_weights_are_judged_as_the_jobs_judge_them(tmp_path: Path) -> None:
         assert judged == (code, code), (code, stored, place)
 
 
-def test_stored_integers_are_scaled(tmp_path: Path) -> None:
-    hdu = fits.PrimaryHDU(kernel(32, 32))
-    hdu.scale("int16", bscale=2**-20, bzero=10485 * 2**-20)
-    hdu.writeto(tmp_path / "p.fits")
-    assert verdict(tmp_path / "p.fits") is None
-    assert read_psf(tmp_path / "p.fits", LIMITS).total == pytest.approx(1, abs=1e-3)
-
-
 def test_the_sum_is_that_within_the_reach(tmp_path: Path) -> None:
     wide = np.zeros((3, REACH_GRID_PX + 20), "f4")
     wide[1, wide.shape[1] // 2] = 0.9
@@ -219,6 +204,10 @@ def test_images_and_products_are_no_psfs(tmp_path: Path) -> None:
     assert verdict(tmp_path / "psf.fits") is None
     write_image(tmp_path / "image.fits")
     assert verdict(tmp_path / "image.fits") == "psf-sum"
+    integers = fits.PrimaryHDU(kernel(32, 32))
+    integers.scale("int16", bscale=2**-20, bzero=10485 * 2**-20)
+    integers.writeto(tmp_path / "integers.fits")
+    assert verdict(tmp_path / "integers.fits") is None
     weights = fits.getdata(tmp_path / "psf.fits")
     fits.PrimaryHDU(weights, fits.Header({"PSFID": "a"})).writeto(tmp_path / "product.fits")
     assert verdict(tmp_path / "product.fits") == "image-as-psf"

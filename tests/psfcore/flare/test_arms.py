@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import matplotlib.image
@@ -17,15 +18,12 @@ from psfcore.flare.arms import (
     ArmMeasurement,
     measure_arms,
     prepared,
-    ring_halo,
-    search_arms,
     smooth,
     source_centre,
 )
 from psfcore.flare.arms_fit import (
     Geometry,
     check_enough_orders,
-    order_positions,
     orders_between,
     select_pixels,
 )
@@ -118,13 +116,12 @@ def test_errors_cover_the_true_values(expected: NDArray[np.float64]) -> None:
     assert np.all((width > 0.7) & (width < 1.4)), width
 
 
-def test_a_difference_of_two_images_gives_the_same_arms(expected: NDArray[np.float64]) -> None:
+def test_arms_of_a_difference_and_of_an_inexact_centre(
+    expected: NDArray[np.float64],
+) -> None:
     image, saturated = observed(expected, 5)
     before = np.random.default_rng(6).poisson(corona()).astype(float)
     check_arms(measure_arms(image, reference=before, saturated=saturated))
-
-
-def test_an_inexact_centre_and_masked_pixels_are_tolerated(expected: NDArray[np.float64]) -> None:
     image, saturated = observed(expected, 7)
     image[30:40, 100:140] = np.nan
     found = measure_arms(image, (124.5, 118.0), saturated=saturated)
@@ -155,32 +152,26 @@ def test_images_without_measurable_arms_are_refused() -> None:
         assert caught.value.code == code
 
 
-def test_the_arms_of_the_aiapy_psf_are_recovered(shared: Path) -> None:
+def test_the_arms_of_the_aiapy_psf_are_recovered(real: Callable[[str], Path]) -> None:
     """aiapy built this PSF with a spacing of 16.26 px and four angles.
 
     The PSF has no noise, so the stated errors are not tested.
     """
-    path = shared / "data" / "real" / "psf" / "derived_aia171_psf_aiapy0.10.2.fits"
-    if not path.exists():
-        pytest.skip(f"real data not available: {path}")
     middle = slice(2048 - 250, 2048 + 251)
+    path = real("psf/derived_aia171_psf_aiapy0.10.2.fits")
     psf = np.asarray(fits.getdata(path), dtype=np.float64)[middle, middle]
     found = measure_arms(psf, (250.0, 250.0), n_arms=4)
     assert found.angles_deg == pytest.approx((-50.38, -40.13, 39.57, 49.81), abs=0.05)
     assert found.spacing_px == pytest.approx(16.26, abs=0.005)
 
 
-def test_flare_loops_at_the_limb_are_refused(shared: Path) -> None:
+def test_flare_loops_at_the_limb_are_refused(real: Callable[[str], Path]) -> None:
     """The loops are 100 px across, so their orders, 16 px apart, overlap: an error must come, not a number."""
-    folder = shared / "data" / "real" / "aia" / "limbflare_20120719"
-    files = sorted(folder.glob("*.fits"))
-    if not files:
-        pytest.skip(f"real data not available: {folder}")
+    files = sorted(real("aia/limbflare_20120719").glob("*.fits"))
     with fits.open(files[1]) as hdus:
         image = np.asarray(next(h.data for h in hdus if h.data is not None), dtype=np.float64)
-    with pytest.raises(DataError) as caught:
+    with pytest.raises(DataError, match="too-few-peaks"):
         measure_arms(image, saturated=image > 15_000, n_arms=4)
-    assert caught.value.code == "too-few-peaks"
 
 
 # --- the image -------------------------------------------------------------------------------------------
@@ -215,44 +206,6 @@ def test_the_centre_is_the_given_one_or_the_patch_or_the_brightest_pixel() -> No
         source_centre(plane, ALL, patch, (81.0, 3.0))
 
 
-def test_the_halo_is_the_ring_median_without_the_arms() -> None:
-    y, x = np.indices(SHAPE)
-    radius = np.hypot(x - 40, y - 30)
-    halo = 100 / (1 + radius)
-    image = halo + np.where(np.abs(y - 30) <= 1, 50.0, 0.0)
-    found = ring_halo(image, ALL, (40.0, 30.0), np.array([0.0]), 3.0)
-    away = (radius > 5) & (radius < 28)
-    np.testing.assert_allclose(found[away], halo[away], rtol=0.15)
-
-
-# --- the search ------------------------------------------------------------------------------------------
-
-
-SEARCHED_PX, SEARCHED_CENTRE = 201, (100.0, 100.0)
-ANGLES_DEG, ORDERS_PX = (-70.0, 20.0), 9.0
-
-
-def with_orders() -> NDArray[np.float64]:
-    y, x = np.indices((SEARCHED_PX, SEARCHED_PX))
-    image = np.random.default_rng(1).normal(10.0, 1.0, (SEARCHED_PX, SEARCHED_PX))
-    for angle in np.deg2rad(ANGLES_DEG):
-        for k in (*range(-10, 0), *range(1, 11)):
-            along = k * ORDERS_PX
-            apart = np.hypot(
-                x - SEARCHED_CENTRE[0] - along * np.cos(angle), y - SEARCHED_CENTRE[1] - along * np.sin(angle)
-            )
-            image += 30 * np.exp(-0.5 * (apart / 1.2) ** 2)
-    return image
-
-
-def test_angles_and_spacing_are_found() -> None:
-    image = with_orders()
-    everywhere = np.ones(image.shape, dtype=bool)
-    angles, spacing = search_arms(image, everywhere, SEARCHED_CENTRE, 2, (12.0, 95.0))
-    assert angles == pytest.approx(ANGLES_DEG, abs=0.5)
-    assert spacing == pytest.approx(ORDERS_PX, rel=0.01)
-
-
 # --- the orders ------------------------------------------------------------------------------------------
 
 
@@ -260,16 +213,7 @@ PATTERN = np.array([0.0, np.pi / 2, 10.0])  # two arms, along x and y; orders 10
 GEOMETRY = Geometry((50.0, 50.0), 3.0, (15.0, 40.0))
 
 
-def test_orders_lie_at_multiples_of_the_spacing() -> None:
-    arm, k = orders_between(PATTERN, GEOMETRY.radii_px)
-    assert sorted(set(np.abs(k))) == [2, 3, 4] and arm.tolist() == [0] * 6 + [1] * 6
-    x, y = order_positions(GEOMETRY.centre, PATTERN, arm, k)
-    np.testing.assert_allclose(x[:6], 50 + 10 * k[:6])
-    np.testing.assert_allclose(y[:6], 50.0)
-    np.testing.assert_allclose(y[6:], 50 + 10 * k[6:])
-
-
-def test_orders_on_unusable_pixels_or_off_the_image_are_left_out() -> None:
+def test_orders_on_unusable_pixels_are_left_out_and_few_refused() -> None:
     usable = np.ones((85, 101), dtype=bool)  # the order at y = 90 is off the image
     usable[45:56, 66:75] = False  # around the order at x = 70
     arm, k = orders_between(PATTERN, GEOMETRY.radii_px)
@@ -283,9 +227,6 @@ def test_orders_on_unusable_pixels_or_off_the_image_are_left_out() -> None:
     pixels, basis = orders.planes()[0]
     assert (orders.nearest[pixels] == 0).all()
     np.testing.assert_allclose(basis.T @ basis, np.eye(3), atol=1e-12)
-
-
-def test_an_arm_of_few_orders_is_refused() -> None:
     check_enough_orders(np.array([0, 0, 0, 1, 1, 1]), 2)
     with pytest.raises(DataError, match=r"expected at least 3 orders .*; got 3, 1") as caught:
         check_enough_orders(np.array([0, 0, 0, 1]), 2)

@@ -113,7 +113,7 @@ def test_a_core_blur_is_in_the_kernel_with_its_own_value() -> None:
     assert psf.kernel.sum() == pytest.approx(plain.sum(), rel=1e-12)
 
 
-def test_stretched_scatter_is_in_the_kernel_along_its_direction() -> None:
+def test_effects_of_the_optics_are_in_the_kernel_at_their_place() -> None:
     """To first order it is the true stretched PSF: p is ln(1 + stretch) along x."""
     stretch, plain = 0.02, fitted_kernel()
     psf = corrected(effect("anisotropic_scatter"), values=(float(np.log1p(stretch)), 0.0))
@@ -124,9 +124,6 @@ def test_stretched_scatter_is_in_the_kernel_along_its_direction() -> None:
     true = (total_kernel(at, diffraction(), REACH_PX) - plain)[window]
     assert np.vdot(change, true) / np.vdot(true, true) == pytest.approx(1, abs=0.1)
     assert change[40, 60] > 0 > change[60, 40]  # more along x, less along y
-
-
-def test_a_ghost_is_in_the_kernel_at_its_place() -> None:
     copy = Change(lambda n, images: displaced(gaussian_filter(images[n], 2.0), 60, -30), unocculted=False)
     held = replace(effect("ghost"), changes=lambda view: [copy], held=None)
     change = corrected(held, values=(0.03,)).kernel - fitted_kernel()
@@ -135,9 +132,6 @@ def test_a_ghost_is_in_the_kernel_at_its_place() -> None:
     # The copy's light is taken from the rest of the kernel, whose sum stays the same.
     around = change[MIDDLE - 60 : MIDDLE, MIDDLE + 30 : MIDDLE + 90].sum()
     assert around == pytest.approx(0.03 * fitted_kernel().sum(), rel=0.4)
-
-
-def test_an_effect_that_varies_over_the_field_is_taken_at_its_centre() -> None:
     kernel = corrected(effect("field_dependent_scatter"), values=(0.5, 0.5, 0.5)).kernel
     assert np.abs(kernel - fitted_kernel()).max() < 1e-3 * fitted_kernel().max()
 

@@ -121,9 +121,8 @@ def test_wrong_noise_figures_are_noticed_and_are_not_a_gap(clean: Transit) -> No
     assert any("times the stated variance" in caution for caution in found.cautions)
     assert found.judgement.members == calibration.answer(found.judgement.hypotheses, 0.95)
     for library, coverage, code in ((FEW, 0.98, "bad-coverage"), ((), 0.95, "bad-library")):
-        with pytest.raises(DataError) as refusal:
+        with pytest.raises(DataError, match=code):
             diagnose(clean, library=library, coverage=coverage, calibration=calibration)
-        assert refusal.value.code == code
     # The noise of the images is measured.
     noise = measured_noise(clean)
     assert noise is not None and noise.agrees
@@ -144,9 +143,8 @@ def test_cautions_tell_what_one_pointing_and_few_images_cannot_show(clean: Trans
     few = diagnose(replace(clean, frames=(one.frames[0], *one.frames[2:])), library=FEW, refit=False)
     assert few.judgement.verdict == "inconclusive"
     assert any("held out" in caution for caution in few.cautions)
-    with pytest.raises(DataError) as refusal:
+    with pytest.raises(DataError, match="too-few-frames"):
         diagnose(replace(clean, frames=one.frames[:2]), library=FEW)
-    assert refusal.value.code == "too-few-frames"
     # So does a closure whose prediction is less exact than the gap.
     (caution,) = caution_of_closure("ghost", gap_pct=6.4, error_pct=6.8)
     assert "closure by ghost" in caution and "6.8 %" in caution and "6.4 %" in caution

@@ -7,14 +7,13 @@ from functools import cache
 import numpy as np
 import pytest
 
-from psfcore.gap.evidence.cells import DiscCells
 from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.linear_model import UNLIKELY
 from psfcore.gap.ideal_observer import IdealObserver, Left, ideal_observer, left_by_hypotheses
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.transit import SimulatedTransit, simulate
 from psfcore.transit.transit import Transit
-from tests.psfcore.gap.linear_models import FEW, dense, effect_of, with_left, with_residuals
+from tests.psfcore.gap.linear_models import FEW, dense, effect_of, with_residuals
 from tests.psfcore.gap.small_gaps import changed
 from tests.transit_files import TRUTH, diffraction
 
@@ -70,27 +69,6 @@ def test_every_hypothesis_leaves_what_dense_least_squares_leave(evidence: Eviden
         data = np.append(residual, np.zeros(len(names)))
         rest = data - design @ np.linalg.lstsq(design, data, rcond=None)[0]
         assert left_of(left_by_hypotheses(model), *names).chi2 == pytest.approx(float(rest @ rest), rel=1e-6)
-
-
-def test_what_a_rival_leaves_is_what_noisy_data_hold_against_it(evidence: Evidence) -> None:
-    """Over noise realisations, chi2 of the rival minus chi2 of the truth has the mean lambda and the variance 4 lambda."""
-    exact = with_residuals(evidence, {"dark_offset": 8.0})
-    lam = left_of(left_by_hypotheses(exact)).chi2
-    assert 10 < lam < 100
-    rng = np.random.default_rng(6)
-    white = {disc.index: disc.white for disc in exact.discs}
-
-    def noisy(disc: DiscCells) -> np.ndarray:
-        return disc.residual + np.linalg.solve(white[disc.index], rng.standard_normal(disc.residual.size))
-
-    falls = []
-    for _ in range(100):
-        left = left_by_hypotheses(with_left(exact, noisy))
-        falls.append(left_of(left).chi2 - left_of(left, "dark_offset").chi2)
-    error = 2 * np.sqrt(lam / len(falls))
-    # One parameter gains 1 from noise alone.
-    assert np.mean(falls) == pytest.approx(lam + 1, abs=4 * error)
-    assert np.std(falls) == pytest.approx(2 * np.sqrt(lam), rel=0.2)
 
 
 def test_a_negative_share_of_light_is_no_rival(evidence: Evidence) -> None:

@@ -56,6 +56,9 @@ def test_a_ladder_of_exposures_separates_a_dark_offset_from_a_halo_and_from_a_le
     # What cannot be planned is named with its reason.
     assert "measured in the images" in one.limits.untestable["scene_evolution"]
     assert "same gain mode" in one.limits.untestable["gain_mismatch"]
+    two = replace(plan_with(ONE), shots=plan_with(ONE).shots[:2])
+    with pytest.raises(DataError, match=r"at least 3 images.* got 2"):
+        planned_limits(two, diffraction(), library=FEW)
 
 
 def test_a_plan_as_json() -> None:
@@ -74,12 +77,6 @@ def test_a_plan_as_json() -> None:
     assert content["searched"] == ["wide_halo"]
 
 
-def test_a_plan_of_two_images_is_refused() -> None:
-    two = replace(plan_with(ONE), shots=plan_with(ONE).shots[:2])
-    with pytest.raises(DataError, match=r"at least 3 images.* got 2"):
-        planned_limits(two, diffraction(), library=FEW)
-
-
 def test_text_and_page_name_every_effect_and_pair() -> None:
     plan = planned(ONE)
     html = plan_page(plan)
@@ -90,14 +87,9 @@ def test_text_and_page_name_every_effect_and_pair() -> None:
         assert name in text and name.replace("_", " ") in page
     for pair in plan.limits.alike:
         assert pair.would_separate in text and pair.would_separate in page
-    assert f"{strength_of(plan, 'dark_offset'):.3g}" in text
+    assert f"{strength_of(plan, 'dark_offset'):.3g}" in text and "wide_halo*" in text
     cells = [tag.text for tag in read_page(html) if tag.name == "td"]
     assert all(f"{distance:.1f}" in cells for distance in plan.limits.distances.values())
-    assert f"{IMAGES} images of {SIZE_PX} x {SIZE_PX} px" in page
-    assert "wide_halo*" in text and "searches for its position or form" in text
-
-
-def test_a_strength_that_would_not_be_found_is_said() -> None:
     hidden = EffectLimits((ParameterLimits("offset", "DN", 2.0, None, None),))
     strong = EffectLimits((ParameterLimits("share", "", 0.1, 0.2, None),))
     limits = replace(
@@ -105,8 +97,5 @@ def test_a_strength_that_would_not_be_found_is_said() -> None:
     )
     plan = replace(planned(LADDER), left_out={}, limits=limits)
     text, html = "\n".join(lines(plan)), plan_page(plan)
-    assert f"offset: {NOT_FOUND}" in text and "hidden at every plausible size" in text
-    assert "share 0.2" in text and "hidden at its likely size" in text
-    assert "would show 0 of 2 effects at their likely size; all of them could be told apart" in text
-    assert "No two effects are closer than 3 sigma" in html and "could not be tested" not in html
-    assert "could not use" not in html and "not usable" not in text
+    assert f"offset: {NOT_FOUND}" in text and "share 0.2" in text and "would show 0 of 2 effects" in text
+    assert "could not be tested" not in html and "not usable" not in text

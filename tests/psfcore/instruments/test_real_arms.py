@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -29,12 +30,10 @@ def cepstrum(image: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(ndimage.gaussian_filter(np.fft.fftshift(np.fft.ifft2(rest).real), 0.8))
 
 
-def test_a_real_image_of_trace_has_the_arms_of_the_file(shared: Path) -> None:
+def test_a_real_image_of_trace_has_the_arms_of_the_file(real: Callable[[str], Path]) -> None:
     """Of all spacings from 8 to 32 px and all directions, those of the file stand out. Between the two lines of the channel,
     at 171.1 and 174.5 angstrom, the spacing is 1 % above that of the file."""
-    path = shared / "data" / "real" / "other" / "trace_19980519_222143_171.fits.gz"
-    if not path.exists():
-        pytest.skip(f"real data not available: {path}")
+    path = real("other/trace_19980519_222143_171.fits.gz")
     trace = load_instrument("trace_171")
     (mesh,) = trace.meshes
     reach_mm = trace.wavelength_angstrom * 1e-7 * trace.focal_length_mm

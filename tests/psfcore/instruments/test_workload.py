@@ -5,13 +5,10 @@ from __future__ import annotations
 import subprocess
 import sys
 import tracemalloc
-from typing import Any
 
-import numpy as np
 import pytest
 
 from psfcore.build import build_psf
-from psfcore.diffraction import mesh_series, open_aperture
 from psfcore.diffraction.pupil import MaskGrid, entrance_pupil
 from psfcore.errors import DataError
 from psfcore.instruments.files import instrument_names
@@ -80,33 +77,6 @@ def test_shipped_instruments_are_far_from_the_limits() -> None:
         check_workload(instrument, name)
         work = workload(instrument, 4096)
         assert max(work.cells, default=0) < MOST_CELLS / 5 and work.samples < MOST_SAMPLES / 2, name
-
-
-def test_the_sizes_are_those_of_the_arrays(monkeypatch: pytest.MonkeyPatch) -> None:
-    aia, size = load_instrument("aia_171"), 64
-    work, mesh, seen = workload(aia, size), aia.meshes[0], []
-    optics = {"wavelength_angstrom": aia.wavelength_angstrom, "pixel_pitch_um": aia.detector.pixel_pitch_um}
-    series = {key: getattr(mesh, key) for key in ("pitch_um", "wire_um", "windows", "angle_deg")}
-
-    def cells(edges: Any, light: Any, spacing_px: float) -> Any:
-        seen.append(len(edges) - 1)
-        return np.arange(1)
-
-    def light_beyond(v: Any, obscured: float) -> Any:
-        seen.append(len(v))
-        return np.ones(len(v))
-
-    monkeypatch.setattr(mesh_series, "_first_of_each_cell", cells)
-    spacing_px = mesh_series.order_spacing_px(
-        **optics, pitch_um=mesh.pitch_um, distance_mm=aia.focal_length_mm
-    )
-    mesh_series.rotated_mesh_kernel(spacing_px, **series, size=size)
-    monkeypatch.setattr(open_aperture, "airy_light_beyond", light_beyond)
-    open_aperture.airy_kernel(
-        **optics, focal_length_mm=aia.focal_length_mm, diameter_mm=aia.aperture.diameter_mm, size=size
-    )
-    for count, expected in zip(seen, (work.cells[0], work.airy_points), strict=True):
-        assert 0.9 * expected <= count <= 1.02 * expected
 
 
 def test_the_mask_and_its_edges_are_not_larger_than_said() -> None:

@@ -17,6 +17,7 @@ import pytest
 from psfcore.drawing.page import with_error
 from psfcore.errors import DataError
 from psfcore.evaluation.evaluation import evaluate
+from psfcore.evaluation.shapes import held_out_kernels
 from psfcore.psf import Psf, crop_or_pad, cumulative_curve
 from psfcore.report import report as report_module
 from psfcore.report.page import report_page
@@ -25,11 +26,11 @@ from psfcore.report.report import PsfReport, make_report, report_json
 from psfcore.scatter.fit import TransitFit
 from psfcore.scatter.reconstruction import Progress
 from psfcore.scatter.total_psf import SCATTER
-from psfcore.scatter.validation.cross_validation import FoldSample, bootstrap_samples, shared_step
+from psfcore.scatter.validation.cross_validation import bootstrap_samples
 from psfcore.simulate.scatter_truth import total_kernel
 from psfcore.tables.make import TOTAL, tables_of
 from psfcore.transit.prepare import FrameCounts, Prepared
-from psfcore.transit.transit import Transit, folds
+from psfcore.transit.transit import Transit
 from tests.blank_figures import blank_figures
 from tests.html_page import check_stands_alone, read_page
 from tests.psfcore import small_transits
@@ -93,29 +94,16 @@ def given() -> PsfReport:
 
 
 def test_each_image_is_evaluated_with_the_psf_of_the_fold_that_holds_it_out() -> None:
-    """By hand for one fold: the step of its fitted images, and the light that its PSF scatters into the discs."""
     report = whole()
     assert report.fit is not None and report.held_out
-    solution, images = report.fit.solution, len(report.transit.frames)
-    fold = folds(images)[1]
-    counts = tuple(int(n in fold.fitted) for n in range(images))
-    step = shared_step(solution, FoldSample(0, 1, counts, fold.held_out))
-    kernel = solution.total.kernel(solution.inversion.coordinates + step)
-    by_hand = evaluate(report.transit, lambda _n: kernel, seed=5)
-    want = {f.file: f.residual_pct for f in by_hand.frames if f.index in fold.held_out}
-    got = {f.file: f.residual_pct for f in report.evaluation.frames}
-    assert want and all(got[file] == pytest.approx(residual, abs=1e-6) for file, residual in want.items())
+    by_hand = evaluate(report.transit, held_out_kernels(report.fit.solution), seed=5)
+    want, got = ({f.file: f.residual_pct for f in of.frames} for of in (by_hand, report.evaluation))
+    assert got == pytest.approx(want, abs=1e-6)
     within = evaluate(report.transit, lambda _n: report.fit.kernel, seed=5)  # type: ignore[union-attr]
     assert any(abs(got[f.file] - f.residual_pct) > 1e-3 for f in within.frames), "not held out"
 
 
-def test_progress_covers_all_stages_and_never_decreases() -> None:
-    shares = [step / steps for _, step, steps in progress_of_whole()[1]]
-    assert len(shares) > 50 and shares[0] < 0.1 and 0.8 < shares[-1] <= 1
-    assert all(later >= earlier for earlier, later in itertools.pairwise(shares))
-
-
-def test_the_json_holds_the_numbers_of_the_page() -> None:
+def test_the_json_holds_the_numbers_and_progress_covers_all_stages() -> None:
     found = whole_json()
     assert found["schema"] == "psf-report/1" and found["sentence"] == whole().sentence
     assert [o["offset_dn"] for o in found["evaluation"]["dark_offsets"]["offsets"]] == [-5.0, -3.0, 3.0, 5.0]
@@ -123,6 +111,9 @@ def test_the_json_holds_the_numbers_of_the_page() -> None:
     assert len(found["cross_validation"]["totals"]) == found["cross_validation"]["fits"] == 12
     assert {s["name"] for s in found["fit"]["shapes"]} >= {"stretched", "core"}
     assert found["inputs"]["noise"]["photon_gain_dn"] > 0 and found["seed"] == 5
+    shares = [step / steps for _, step, steps in progress_of_whole()[1]]
+    assert len(shares) > 50 and shares[0] < 0.1 and 0.8 < shares[-1] <= 1
+    assert all(later >= earlier for earlier, later in itertools.pairwise(shares))
 
 
 def test_a_given_psf_fitted_to_these_images_is_not_tested_independently() -> None:

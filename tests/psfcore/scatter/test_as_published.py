@@ -12,8 +12,6 @@ from functools import cache
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.optimize import lsq_linear
-from threadpoolctl import threadpool_info, threadpool_limits
 
 from psfcore.errors import DataError
 from psfcore.psf import REACH_GRID_PX, cumulative_curve, squared_radii
@@ -66,24 +64,6 @@ def some(of: Equations, chosen: NDArray[np.intp] | NDArray[np.bool_]) -> Equatio
     return Equations(*(values[chosen] for values in vars(of).values()))
 
 
-def blas_threads() -> set[int]:
-    return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
-
-
-def test_small_systems_are_solved_by_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    """For any limit of threads: they slow down such small factorisations, most of all on busy cores."""
-    seen = set()
-
-    def counted(*arguments: object, **options: object) -> object:
-        seen.update(blas_threads())
-        return lsq_linear(*arguments, **options)
-
-    monkeypatch.setattr(as_published, "lsq_linear", counted)
-    with threadpool_limits(limits=2, user_api="blas"):
-        free_fit(made_equations(), COUNTS, seed=1, subsets=2)
-        assert seen == {1} and blas_threads() == {2}
-
-
 def test_a_subset_has_equal_numbers_from_each_stratum_and_unocculted_ones() -> None:
     whole, rng = made_equations(), np.random.default_rng(0)
     chosen = choose_subset(whole, rng)
@@ -105,15 +85,7 @@ def test_a_subset_has_equal_numbers_from_each_stratum_and_unocculted_ones() -> N
         choose_subset(some(whole, whole.stratum == UNOCCULTED), rng)
 
 
-def test_equations_of_frames_are_joined_in_order() -> None:
-    whole = made_equations()
-    half = np.arange(len(whole)) < 1500
-    joined = Equations.joined([some(whole, half), some(whole, ~half)])
-    for name in ("observed", "ring_sums", "unscattered", "scale", "stratum"):
-        np.testing.assert_array_equal(getattr(joined, name), getattr(whole, name))
-
-
-def test_free_shells_are_those_planted_and_a_seed_gives_one_fit() -> None:
+def test_free_shells_are_those_planted_and_the_worst_subsets_are_dropped() -> None:
     found, full = free_fit(made_equations(), COUNTS, seed=1, subsets=10), COUNTS > 0
     assert found.fits.shape == (7, COUNTS.size)
     np.testing.assert_allclose(found.mean * COUNTS, PLANTED * COUNTS, atol=1e-3)
@@ -123,19 +95,13 @@ def test_free_shells_are_those_planted_and_a_seed_gives_one_fit() -> None:
     again, other = (free_fit(made_equations(), COUNTS, seed=seed, subsets=10).mean for seed in (1, 2))
     np.testing.assert_array_equal(found.mean, again)
     assert (found.mean != other).any()
-
-
-def test_the_worst_subsets_are_dropped() -> None:
-    """One equation of 1500 is wrong; subsets that contain it have a larger misfit."""
+    # One equation of 1500 is wrong; subsets that contain it have a larger misfit.
     bad = made_equations()
     bad.observed[7] *= 1.5
     found = free_fit(bad, COUNTS, seed=1, subsets=20)
     assert found.fits.shape[0] == 14
     np.testing.assert_allclose(found.mean * COUNTS, PLANTED * COUNTS, atol=2e-3)
     assert free_fit(bad, COUNTS, seed=1, subsets=1).fits.shape[0] == 1
-
-
-def test_no_shell_is_negative() -> None:
     found = free_fit(made_equations(noise=3.0, seed=2), COUNTS, seed=1, subsets=4)
     assert found.fits.min() >= 0
     # Without the bound, some would be negative.
@@ -178,16 +144,13 @@ def off(of: Published) -> Vector:
     return np.asarray(of.curve_pct - true_curve(tuple(of.radii_px.tolist()), COMPACT))
 
 
-def test_the_recipe_is_followed_to_its_end() -> None:
+def test_the_recipe_is_followed_and_its_law_is_its_scatter_and_its_curve() -> None:
     of, seen = recipe(AS_PUBLISHED)
     assert [fit for fit, _ in of.rounds] == ["free shells"] * 3 + ["softened power law"] * 3
     assert len(dict.fromkeys(seen)) == 12  # deconvolving and equations, six times
     assert of.radii_px.tolist() == [0.5, 2, 5, 10, 20, 50]
     assert of.spread is not None and all(np.isfinite(value) for value in of.spread.values())
-
-
-def test_its_law_is_its_scatter_and_its_curve() -> None:
-    """a / (b + r)^c outside the centre, the remaining light at the centre, convolved with diffraction."""
+    # a / (b + r)^c outside the centre, the remaining light at the centre, convolved with diffraction.
     for choices, grid_px in ((AS_PUBLISHED, GRID_PX), (ALL_CORRECTED, REACH_GRID_PX)):
         of, _ = recipe(choices)
         scatter, middle = of.scatter, grid_px // 2

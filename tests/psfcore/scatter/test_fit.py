@@ -92,7 +92,9 @@ def test_overdispersion_is_the_chi2_of_the_means_unless_chance_explains_it() -> 
     assert overdispersion(dataclasses.replace(inversion, frames=inversion.frames[:3])) == 1.0
 
 
-def test_an_effect_that_the_model_lacks_enlarges_all_errors(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_effect_that_the_model_lacks_enlarges_all_errors(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     inversion = with_chi2(solved().inversion, 25.0)
     fit = fit_of(monkeypatch, dataclasses.replace(solved(), inversion=inversion))
     assert "vary 5.0 times as much as noise explains" in "; ".join(fit.limits)
@@ -100,9 +102,6 @@ def test_an_effect_that_the_model_lacks_enlarges_all_errors(monkeypatch: pytest.
     assert fit.value_sigma["c"] == pytest.approx(5 * inversion.value_sigma["c"])
     np.testing.assert_allclose(fit.curve.sigma[:7], 5 * inversion.curve_sigma, rtol=0.02)
     assert fit_json(fit)["overdispersion"] == pytest.approx(25.0)
-
-
-def test_limits_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [line for line in fitted().limits if "field is 128 px" in line]
     transit, inversion = solved().transit, solved().inversion
     one_pointing = [dataclasses.replace(f, pointing=2) for f in transit.frames]
@@ -191,7 +190,7 @@ def as_json(fit: TransitFit) -> dict[str, Any]:
     return content
 
 
-def test_a_report_is_json_with_the_values_of_the_fit() -> None:
+def test_report_and_sentence_have_the_values_of_the_fit() -> None:
     fit, content = fitted(), as_json(fitted())
     assert (content["schema"], content["shape"]) == ("psf-fit/1", "softened-power-law")
     assert content["curve"]["light_beyond_pct"] == fit.curve.pct.tolist()
@@ -213,9 +212,6 @@ def test_a_report_is_json_with_the_values_of_the_fit() -> None:
     assert len(content["free_shells"]["weight"]["median"]) == 50
     assert content["first_guess"]["best_fov"] == fit.first_guess.best_pointing
     assert "stretch" not in content and "as_published" not in content
-
-
-def test_the_sentence_has_the_curves_numbers() -> None:
     fit, words = fitted(), fit_sentence(fitted())
     at = {r: (p, s) for r, p, s in zip(RADII_PX, fit.curve.pct, fit.curve.sigma, strict=True)}
     found = [float(number) for number in re.findall(r"\d+\.\d+", words)]

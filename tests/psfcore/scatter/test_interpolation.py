@@ -129,7 +129,7 @@ def test_between_two_fitted_transits_the_curve_agrees_with_the_truth_within_its_
     assert sigma.max() < 3.0, "a stated error that says nothing would agree with every truth"
 
 
-def test_the_stated_error_is_that_of_a_sudden_change_at_an_unknown_time() -> None:
+def test_the_stated_error_is_that_of_a_sudden_change() -> None:
     before, after = shape_of(EARLY), shape_of(LATE)
     q0, q1 = np.array(before.coordinates), np.array(after.coordinates)
     changed_at = (np.arange(10_000) + 0.5) / 10_000
@@ -139,17 +139,6 @@ def test_the_stated_error_is_that_of_a_sudden_change_at_an_unknown_time() -> Non
         off = truths - np.array(found.coordinates)
         np.testing.assert_allclose(off.T @ off / changed_at.size, found.covariance, rtol=1e-9)
         np.testing.assert_allclose(off.mean(axis=0), 0, atol=1e-12)
-
-
-def test_at_the_epochs_the_psf_and_its_errors_are_those_of_the_fits() -> None:
-    before, after = psf_of(EARLY, 0.01), psf_of(LATE, 0.03)
-    for time, end in ((T0, before), (T1, after)):
-        psf = made(before, after, time)
-        assert psf.fitted == end.fitted
-        np.testing.assert_allclose(psf.kernel, end.kernel, atol=1e-9)
-
-
-def test_errors_of_equal_fits_combine_as_independent_errors() -> None:
     found = interpolated_shape(shape_of(EARLY, 0.02), shape_of(EARLY, 0.02), 0.5)
     np.testing.assert_allclose(np.array(found.covariance), 0.5 * 0.02**2 * np.eye(3), rtol=1e-12)
     found = interpolated_shape(shape_of(EARLY, 0.02), shape_of(LATE, 0.04), 0.25)
@@ -158,15 +147,25 @@ def test_errors_of_equal_fits_combine_as_independent_errors() -> None:
     np.testing.assert_allclose(np.array(found.covariance), expected, rtol=1e-12)
 
 
-def test_values_and_errors_of_parameters() -> None:
+def test_at_the_epochs_the_psf_is_that_of_the_fits_for_any_size() -> None:
+    before, after = psf_of(EARLY, 0.01), psf_of(LATE, 0.03)
+    for time, end in ((T0, before), (T1, after)):
+        psf = made(before, after, time)
+        assert psf.fitted == end.fitted
+        np.testing.assert_allclose(psf.kernel, end.kernel, atol=1e-9)
+    small, whole = (
+        made(psf_of(EARLY, size=SMALL), psf_of(LATE, size=SMALL)),
+        made(psf_of(EARLY), psf_of(LATE)),
+    )
+    np.testing.assert_allclose(small.kernel, crop_or_pad(whole.kernel, SMALL), rtol=1e-9, atol=1e-15)
+
+
+def test_errors_of_parameters_and_of_a_curve_are_those_of_possible_psfs() -> None:
     said = parameters_of(shape_of(EARLY, 0.01))
     assert said["b_px"]["value"] == pytest.approx(6.15) and said["b_px"]["sigma"] == pytest.approx(0.0615)
     assert said["c"]["sigma"] == pytest.approx(0.01) and said["b_px"]["unit"] == "px"
     assert said["total"]["sigma"] == pytest.approx(0.01 * 0.411 * 0.589)
-
-
-def test_the_error_of_a_curve_is_the_spread_of_possible_psfs() -> None:
-    """The sigma points have the covariance of the fit; for small errors their curves spread by the propagated error."""
+    # The sigma points have the covariance of the fit; for small errors their curves spread by the propagated error.
     psf = made(psf_of(EARLY, 0.004), psf_of(EARLY, 0.004))
     spread = np.std([curve(one) for one in possible_psfs(psf)], axis=0)
     np.testing.assert_allclose(curve_sigma(psf, RADII), spread, rtol=0.02)
@@ -199,14 +198,6 @@ def test_weights() -> None:
     refused("epochs-not-in-order", lambda: weight_at(T0, T0, T0))
 
 
-def test_on_a_smaller_array_the_psf_holds_the_light_that_falls_on_it() -> None:
-    small, whole = (
-        made(psf_of(EARLY, size=SMALL), psf_of(LATE, size=SMALL)),
-        made(psf_of(EARLY), psf_of(LATE)),
-    )
-    np.testing.assert_allclose(small.kernel, crop_or_pad(whole.kernel, SMALL), rtol=1e-9, atol=1e-15)
-
-
 def without(psf: Psf, **changes: Any) -> Psf:
     return dataclasses.replace(psf, **changes)
 
@@ -223,9 +214,7 @@ REFUSED: list[tuple[str, Callable[[Psf], Psf], str]] = [
     ("psf-not-fitted", lambda psf: without(psf, fitted=None), "heliopsf psf fit"),
     ("psf-not-fitted", lambda psf: without(psf, components={}), "diffraction"),
     ("psfs-differ", lambda psf: without(psf, instrument="aia_171"), "hri_euv and aia_171"),
-    ("psfs-differ", lambda psf: without(psf, plate_scale_arcsec=0.6), "0.492 and 0.6"),
     ("psfs-differ", lambda psf: without(psf, wavelength_angstrom=171.0), "None and 171.0"),
-    ("psfs-differ", lambda psf: without(psf, cards={"FILTER": "open"}), "{'FILTER': 'open'}"),
     ("psfs-differ", lambda psf: psf_of(LATE, size=SMALL + 2), "(256, 256) and (258, 258)"),
     (
         "shapes-differ",

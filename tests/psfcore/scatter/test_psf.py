@@ -19,7 +19,7 @@ from tests.psfcore.small_transits import DIFFRACTION, SCATTER
 AT = SOFTENED_POWER_LAW.coordinates({"b_px": 6.15, "c": 2.53, "total": 0.411})
 
 
-def test_scatter_and_diffraction_convolve() -> None:
+def test_scatter_and_diffraction_convolve_for_any_size() -> None:
     """The square agrees with the full reach, except for light that is diffracted back from outside it."""
     total = TotalPsf(DIFFRACTION, SOFTENED_POWER_LAW, (100, 131))
     assert total.size == 262
@@ -33,9 +33,6 @@ def test_scatter_and_diffraction_convolve() -> None:
     inner = (slice(16, -16), slice(16, -16))
     np.testing.assert_allclose(kernel[inner], truth[inner], rtol=1e-10)
     np.testing.assert_allclose(kernel, truth, atol=1e-7)
-
-
-def test_a_pattern_larger_than_the_square_counts_where_it_reaches() -> None:
     wide = np.zeros((401, 401))
     wide[200, 200], wide[200, 390] = 0.9, 0.1  # the second is farther than two pixels of a 64 px field
     total = TotalPsf(wide, SOFTENED_POWER_LAW, (64, 64))

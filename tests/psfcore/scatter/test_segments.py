@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import Convolver
 from psfcore.errors import DataError
-from psfcore.psf import squared_radii
 from psfcore.scatter.power_law import scatter_kernel
 from psfcore.scatter.segments import Segments, segment_sums, shells_as_published
 
@@ -77,16 +76,7 @@ def test_sums_of_any_kind_of_image_are_the_plain_sums() -> None:
         np.testing.assert_allclose(sums, expected, rtol=1e-9, atol=1e-6, err_msg=f"{image.dtype}")
 
 
-def test_light_lands_at_source_plus_offset() -> None:
-    image = np.zeros((41, 41))
-    image[20, 20] = 7.0
-    segments = Segments((0.5, 3.0, 4.5, 6.0), 64)
-    targets = np.array([[20, 22], [16, 20], [23, 16], [20, 20]])
-    expected = np.vstack((7.0 * np.eye(3), np.zeros(3)))
-    np.testing.assert_array_equal(segment_sums(image, targets, segments), expected)
-
-
-def test_sums_weighted_by_segment_are_the_convolution() -> None:
+def test_sums_weighted_by_segment_are_the_convolution_for_any_number_of_threads() -> None:
     """sum over S of psf_S A_S is the image convolved with the kernel that is psf_S on S."""
     image, targets = scene((64, 80)), some_targets((64, 80), 30)
     segments = Segments(PIXEL_WIDE, 128)
@@ -96,6 +86,12 @@ def test_sums_weighted_by_segment_are_the_convolution() -> None:
     np.testing.assert_allclose(
         segment_sums(image, targets, segments) @ weights, convolved[tuple(targets.T)], rtol=1e-9
     )
+    image, targets = scene((101, 340)), some_targets((101, 340), 400)
+    targets = targets[targets[:, 1] > 160]  # running sums begin within the image
+    segments = Segments(PIXEL_WIDE, 128)
+    alone = segment_sums(image, targets, segments)
+    for threads in (2, 3, 16):
+        np.testing.assert_array_equal(segment_sums(image, targets, segments, threads=threads), alone)
 
 
 def test_dark_segments_of_a_bright_image_are_exactly_dark() -> None:
@@ -107,23 +103,7 @@ def test_dark_segments_of_a_bright_image_are_exactly_dark() -> None:
     assert sums[0, 2] > 0.0
 
 
-def test_the_same_for_any_number_of_threads() -> None:
-    image, targets = scene((101, 340)), some_targets((101, 340), 400)
-    targets = targets[targets[:, 1] > 160]  # running sums begin within the image
-    segments = Segments(PIXEL_WIDE, 128)
-    alone = segment_sums(image, targets, segments)
-    for threads in (2, 3, 16):
-        np.testing.assert_array_equal(segment_sums(image, targets, segments, threads=threads), alone)
-
-
-def test_no_target_and_no_segment_on_the_grid_give_nothing() -> None:
-    image = scene((20, 20))
-    assert segment_sums(image, np.empty((0, 2), int), Segments(PUBLISHED)).shape == (0, 50)
-    far = Segments((200.0, 300.0), reach_grid_px=64)
-    np.testing.assert_array_equal(segment_sums(image, np.array([[3, 4]]), far), [[0.0]])
-
-
-def test_what_cannot_be_summed_is_refused() -> None:
+def test_what_cannot_be_summed_is_refused_and_nothing_gives_nothing() -> None:
     for value in (np.nan, np.inf):
         image = scene((60, 60))
         image[50, 10] = value
@@ -132,9 +112,13 @@ def test_what_cannot_be_summed_is_refused() -> None:
     for targets in ([[20, 1]], [[1, -1]]):
         with pytest.raises(ValueError, match="outside it"):
             segment_sums(np.zeros((20, 20)), np.array(targets), Segments(PUBLISHED))
+    image = scene((20, 20))
+    assert segment_sums(image, np.empty((0, 2), int), Segments(PUBLISHED)).shape == (0, 50)
+    far = Segments((200.0, 300.0), reach_grid_px=64)
+    np.testing.assert_array_equal(segment_sums(image, np.array([[3, 4]]), far), [[0.0]])
 
 
-def test_published_shells_are_ten_five_and_thirty_five_none_empty() -> None:
+def test_published_shells_hold_the_light_of_the_full_reach() -> None:
     edges = shells_as_published()
     assert len(edges) == 51 and (edges[10], edges[15]) == (5.0, 10.0)
     widths = np.diff(edges[15:])
@@ -142,17 +126,9 @@ def test_published_shells_are_ten_five_and_thirty_five_none_empty() -> None:
     counts = Segments(edges).counts
     assert counts.min() > 0
     assert counts.sum() == 2048**2 - 1
-
-
-def test_a_pixel_on_an_edge_belongs_to_the_shell_that_begins_there() -> None:
-    label = Segments((1.0, 2.0, 5.0), reach_grid_px=16).label_map(13)
-    r = np.sqrt(squared_radii((13, 13)))
-    expected = np.full(r.shape, -1)
-    expected[(r >= 1) & (r < 2)] = 0
-    expected[(r >= 2) & (r < 5)] = 1
-    np.testing.assert_array_equal(label, expected)
-    assert label[6, 6 + 5] == label[6, 6] == -1
-    assert label[6 + 3, 6 + 4] == -1
+    segments = Segments(shells_as_published())
+    kernel = scatter_kernel(6.15, 2.53, 0.411, 2048)
+    assert segments.counts @ segments.mean_of_map(kernel) == pytest.approx(0.411, rel=1e-12)
 
 
 def test_a_map_of_any_size_is_a_crop_of_the_reach_grid_and_runs_are_its_rows() -> None:
@@ -173,9 +149,3 @@ def test_a_map_of_any_size_is_a_crop_of_the_reach_grid_and_runs_are_its_rows() -
             assert columns.start < columns.stop
             drawn[row + runs.first_dy + 32, columns] = runs.segment[i]
     np.testing.assert_array_equal(drawn, label)
-
-
-def test_means_times_counts_sum_to_the_light_of_the_full_reach() -> None:
-    segments = Segments(shells_as_published())
-    kernel = scatter_kernel(6.15, 2.53, 0.411, 2048)
-    assert segments.counts @ segments.mean_of_map(kernel) == pytest.approx(0.411, rel=1e-12)

@@ -133,7 +133,7 @@ def test_any_size_is_a_crop_of_the_same_kernel(small_reach: None) -> None:
         assert larger.sum() > 1 + 1e-6
 
 
-def test_coordinates_and_values_are_inverse_functions() -> None:
+def test_coordinates_and_values_are_inverse_functions_within_bounds() -> None:
     for shape in SHAPES.values():
         values = {name: (LAW | MORE)[name] for name in shape.names}
         assert shape.values(shape.coordinates(values)) == pytest.approx(values, rel=1e-14)
@@ -144,27 +144,21 @@ def test_coordinates_and_values_are_inverse_functions() -> None:
         coordinate = parameter.coordinate(0.3)
         ahead, behind = parameter.value(coordinate + 1e-5), parameter.value(coordinate - 1e-5)
         assert parameter.slope(coordinate) == pytest.approx((ahead - behind) / 2e-5, rel=1e-7)
-
-
-def test_extreme_coordinates_stay_within_bounds() -> None:
     for at in (-30.0, 30.0):
         values = SOFTENED_POWER_LAW.values(np.array([at, 2.5, at]))
         assert values["b_px"] > 0 and 0 < values["total"] < 1
     for beyond in ([800.0, 2.5, 0.0], [0.0, 2.5, -800.0], [np.nan, 2.5, 0.0]):
         with pytest.raises(DataError, match=r"transit-says-too-little.*expected images that determine"):
             SOFTENED_POWER_LAW.values(np.array(beyond))
-
-
-def test_an_unknown_shape_is_refused_with_the_known_ones() -> None:
-    assert shape_named("knee") is SHAPES["knee"]
-    with pytest.raises(DataError, match=r"unknown-shape.*softened-power-law.*'spiral'"):
-        shape_named("spiral")
-
-
-def test_a_step_is_shortened_to_the_largest_step_of_each_parameter() -> None:
     step = np.array([4.0, 0.3, -0.4])  # eight times the largest of b
     shorter, whole = SOFTENED_POWER_LAW.shortened(step)
     assert not whole
     np.testing.assert_allclose(shorter, step / 8)
     same, whole = SOFTENED_POWER_LAW.shortened(shorter)
     assert whole and np.array_equal(same, shorter)
+
+
+def test_an_unknown_shape_is_refused_with_the_known_ones() -> None:
+    assert shape_named("knee") is SHAPES["knee"]
+    with pytest.raises(DataError, match=r"unknown-shape.*softened-power-law.*'spiral'"):
+        shape_named("spiral")

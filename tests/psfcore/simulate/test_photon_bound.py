@@ -172,7 +172,7 @@ def test_errors_of_places_agree_with_whole_simulations(
         assert bound.places_px[index] == pytest.approx(expected, rel=2e-5)
 
 
-def test_four_times_the_light_halves_the_errors(bound: PhotonBound, sky: TrueSky) -> None:
+def test_four_times_the_light_halves_the_errors_without_clipping(bound: PhotonBound, sky: TrueSky) -> None:
     photons_only = dataclasses.replace(sky.plan, noise=Noise(6.0, 0.0))
     longer = tuple(dataclasses.replace(shot, exposure_s=4 * shot.exposure_s) for shot in sky.plan.shots)
     once = bound_of_sky(dataclasses.replace(sky, plan=photons_only))
@@ -184,9 +184,6 @@ def test_four_times_the_light_halves_the_errors(bound: PhotonBound, sky: TrueSky
         [at.total_sigma for at in four.curve], [at.total_sigma / 2 for at in once.curve], rtol=1e-6
     )
     assert 1.001 * once.total < bound.total < 1.2 * once.total  # what 2 DN of readout cost
-
-
-def test_clipped_pixels_around_the_disc_are_not_used(bound: PhotonBound, sky: TrueSky) -> None:
     clipped = dataclasses.replace(sky.plan, saturation_dn=600.0)
     found = bound_of_sky(dataclasses.replace(sky, plan=clipped))
     assert found.total == pytest.approx(bound.total, rel=1e-9)  # dark pixels are far below it
@@ -194,7 +191,9 @@ def test_clipped_pixels_around_the_disc_are_not_used(bound: PhotonBound, sky: Tr
     assert found.places_px[0] == pytest.approx(bound.places_px[0])  # combined gain does not clip
 
 
-def test_the_bound_of_a_folder_is_that_of_its_transit(tmp_path: Path) -> None:
+def test_the_bound_of_a_folder_is_that_of_its_transit(
+    tmp_path: Path,
+) -> None:
     simulated = simulate(default_plan(3, 64), dataclasses.replace(SCATTER, stretch=0.1), DIFFRACTION, 2)
     write(simulated, tmp_path)
     kept, read = bound_of_sky(simulated.sky), bound_of_sky(read_sky(tmp_path))
@@ -205,9 +204,6 @@ def test_the_bound_of_a_folder_is_that_of_its_transit(tmp_path: Path) -> None:
     assert content["sigma"]["total"] == read.total
     assert content["curve"][0]["radius_px"] == 0.5
     assert len(content["places"]) == 3
-
-
-def test_without_scatter_there_is_no_bound() -> None:
     simulated = simulate(default_plan(1, 64), dataclasses.replace(SCATTER, total=0.0), DIFFRACTION, 1)
     with pytest.raises(DataError, match="no-bound"):
         bound_of_sky(simulated.sky)

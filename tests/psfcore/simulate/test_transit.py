@@ -70,7 +70,7 @@ def counts(plan: Plan) -> list[tuple[int, float, str, int]]:
     return [(*kind, kinds.count(kind)) for kind in dict.fromkeys(kinds)]
 
 
-def test_126_images_are_divided_as_in_the_paper() -> None:
+def test_the_plan_of_the_paper_and_of_any_number_of_images_and_field() -> None:
     assert counts(default_plan(126, 512)) == [
         (1, 5.0, COMBINED, 10),
         (1, 0.9, HIGH, 14),
@@ -78,9 +78,6 @@ def test_126_images_are_divided_as_in_the_paper() -> None:
         (3, 0.9, HIGH, 14),
         (3, 5.0, COMBINED, 10),
     ]
-
-
-def test_a_plan_can_have_any_number_of_images_and_any_field() -> None:
     for images, size_px in itertools.product((1, 2, 3, 7, 30, 61, 200), (64, 100, 512)):
         plan = default_plan(images, size_px)
         assert len(plan.shots) == images
@@ -146,16 +143,13 @@ def test_isotropic_scatter_is_the_power_law_and_every_kernel_sums_to_1() -> None
     assert total_kernel(scatter, DIFFRACTION).sum() == pytest.approx(1, abs=3e-5)  # 1e-5 falls past the reach
 
 
-def test_stretch_follows_its_definition() -> None:
+def test_stretch_and_dipole_follow_their_definitions() -> None:
     """Along t the radius is u / (1 + s), across it v (1 + s)."""
     scatter = dataclasses.replace(SCATTER, stretch=0.2, angle_deg=90.0)
     kernel = anisotropic_kernel(scatter, 256)
     up, right = kernel[128 + 60, 128], kernel[128, 128 + 60]
     assert up == pytest.approx(scatter.a * (6.15 + 60 / 1.2) ** -2.53, rel=1e-12)
     assert right == pytest.approx(scatter.a * (6.15 + 60 * 1.2) ** -2.53, rel=1e-12)
-
-
-def test_dipole_follows_its_definition() -> None:
     scatter = dataclasses.replace(SCATTER, dipole=0.25, angle_deg=0.0)
     kernel = anisotropic_kernel(scatter, 128)
     assert kernel[64, 64 + 20] / kernel[64, 64 - 20] == pytest.approx(1.25 / 0.75, rel=1e-12)
@@ -214,7 +208,7 @@ def test_half_pixels_are_binned_after_the_disc_is_removed() -> None:
 # --- noise, ephemeris, camera -----------------------------------------------------------------------------
 
 
-def test_noise_has_the_variance_of_photon_and_read_noise() -> None:
+def test_noise_has_the_variance_of_photon_and_read_noise_and_repeats_its_seed() -> None:
     plan = default_plan(6, 64, whole_dn=False)
     sky = flat_sky(plan, 60.0)
     pulls: dict[int, list[NDArray[np.float64]]] = {index: [] for index in range(6)}
@@ -230,9 +224,6 @@ def test_noise_has_the_variance_of_photon_and_read_noise() -> None:
         assert abs(np.corrcoef(stacked.reshape(12, -1))[0, 1:]).max() < 0.08  # no seed repeats another's
     frames = np.corrcoef([np.concatenate(pulls[index]).ravel() for index in range(6)])
     assert abs(frames - np.eye(6)).max() < 0.03  # nor an image another's
-
-
-def test_one_observation_without_noise_is_the_blurred_scene_and_with_noise_repeats_its_seed() -> None:
     scene, quiet = solar_scene((48, 48), 2), {"photon_gain_dn": 0.0, "read_noise_dn": 0.0, "seed": 1}
     seen = observe(scene, make_psf(delta(16)), exposure_s=2.0, **quiet)
     np.testing.assert_allclose(seen, scene, rtol=1e-12)
@@ -247,7 +238,7 @@ def test_one_observation_without_noise_is_the_blurred_scene_and_with_noise_repea
     np.testing.assert_array_equal(seen, Noise(6.0, 2.0).observe(flat, 1.4, np.random.default_rng(3)))
 
 
-def test_images_are_whole_dn_over_the_exposure(small: SimulatedTransit) -> None:
+def test_images_are_whole_dn_with_saturation_and_dark_offset(small: SimulatedTransit) -> None:
     for frame in small.transit.frames:
         dn = frame.pixels.astype(np.float64) * frame.exposure_s
         np.testing.assert_allclose(dn, np.rint(dn), atol=1e-3)
@@ -255,9 +246,6 @@ def test_images_are_whole_dn_over_the_exposure(small: SimulatedTransit) -> None:
     part = simulate(default_plan(1, 64, whole_dn=False), SCATTER, DIFFRACTION, 1)
     dn = part.transit.frames[0].pixels * part.transit.frames[0].exposure_s
     assert abs(dn - np.rint(dn)).mean() == pytest.approx(0.25, abs=0.02)
-
-
-def test_high_gain_saturates_and_combined_does_not() -> None:
     plan = default_plan(6, 64, saturation_dn=250.4)
     frames = observed_transit(flat_sky(plan, 400.0), 1).transit.frames
     for frame in frames:
@@ -267,9 +255,6 @@ def test_high_gain_saturates_and_combined_does_not() -> None:
             assert (abs(dn - 250) < 1e-3).sum() > 100
         else:
             assert dn.max() > 1000
-
-
-def test_a_dark_offset_is_added_to_every_pixel() -> None:
     sky = flat_sky(default_plan(3, 64, dark_offset_dn=7.0), 100.0)
     for index, frame in enumerate(observed_transit(sky, 1).transit.frames):
         added = (frame.pixels - sky.expected(index)) * frame.exposure_s
@@ -315,7 +300,7 @@ def test_the_limb_is_on_the_side_of_the_pointing() -> None:
     assert abs(np.corrcoef(east.ravel(), west[:, ::-1].ravel())[0, 1]) < 0.999  # not the same limb
 
 
-def test_a_scene_is_positive_and_follows_from_its_seed() -> None:
+def test_a_scene_has_the_contrasts_of_the_sun_and_its_seed() -> None:
     """The numbers are those of the first version: a seed names the same scene for ever."""
     for shape, mean, brightest in (
         ((64, 64), 1806.6784176258332, 57303.802124101276),
@@ -327,15 +312,9 @@ def test_a_scene_is_positive_and_follows_from_its_seed() -> None:
         assert scene.max() == pytest.approx(brightest, rel=1e-9)
         np.testing.assert_array_equal(scene, solar_scene(shape, 5))
         assert not np.array_equal(scene, solar_scene(shape, 6))
-
-
-def test_a_scene_has_the_contrasts_of_the_sun() -> None:
-    """The real image: 1 % of pixels below 86, median 540, 1 % above 2480, brightest 17000 DN/s."""
+    # The real image: 1 % of pixels below 86, median 540, 1 % above 2480, brightest 17000 DN/s.
     low, middle, high, brightest = np.percentile(solar_scene((384, 384), 1), [1, 50, 99, 100])
     assert 10 < low < 150 and 250 < middle < 1000 and 1500 < high < 10000 and brightest > 5000
-
-
-def test_a_margin_extends_the_scene_beyond_the_field() -> None:
     scene = solar_scene((96, 96), 4, margin_px=30)
     assert scene.shape == (156, 156)
     # The limb is where it is without a margin: dim to its left, bright to its right.
@@ -343,7 +322,7 @@ def test_a_margin_extends_the_scene_beyond_the_field() -> None:
     assert inner[30, 40:].mean() > 1.5 * scene[60, :25].mean()
 
 
-def test_a_scene_from_an_image_is_cut_or_enlarged() -> None:
+def test_a_scene_from_an_image_is_cut_or_enlarged_or_refused() -> None:
     plan = default_plan(3, 64)
     large = np.random.default_rng(1).uniform(0, 100, (300, 280))
     large[5, 5], large[150, 140] = np.nan, -3.0
@@ -355,9 +334,6 @@ def test_a_scene_from_an_image_is_cut_or_enlarged() -> None:
     np.testing.assert_allclose(small, 7.0)
     seen = simulate(plan, SCATTER, DIFFRACTION, 1, scenes={1: scene, 2: small, 3: scene})
     assert seen.sky.scenes[2].max() == pytest.approx(7.0)
-
-
-def test_scenes_without_light_or_of_another_shape_are_refused() -> None:
     for image in (np.zeros((70, 70)), np.full((70, 70), np.nan), np.ones(9)):
         with pytest.raises(DataError, match="bad-scene"):
             scene_from_image(image, default_plan(3, 64))
@@ -396,7 +372,12 @@ def test_a_folder_contains_the_transit_and_its_truth(tmp_path: Path) -> None:
     np.testing.assert_allclose(noise_free, simulated.sky.noise_free[2], rtol=1e-6)
 
 
-def test_a_sky_is_read_back(tmp_path: Path) -> None:
+def test_a_sky_is_read_back_and_a_folder_without_truth_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="not-simulated"):
+        read_sky(tmp_path)
+    (tmp_path / "truth.json").write_text('{"psf": {"b": 1}}')
+    with pytest.raises(DataError, match="not-simulated"):
+        read_sky(tmp_path)
     plan = default_plan(3, 64, beyond="on", beyond_px=20)
     simulated = simulate(plan, SCATTER, DIFFRACTION, 2)
     write(simulated, tmp_path)
@@ -410,14 +391,6 @@ def test_a_sky_is_read_back(tmp_path: Path) -> None:
         share = covered_share(plan.place(index), (0, 0), (64, 64))
         scenes = [true_scene(of, index)[20:-20, 20:-20][share == 0] for of in (sky, simulated.sky)]
         np.testing.assert_allclose(*scenes, rtol=1e-6)
-
-
-def test_a_folder_without_truth_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="not-simulated"):
-        read_sky(tmp_path)
-    (tmp_path / "truth.json").write_text('{"psf": {"b": 1}}')
-    with pytest.raises(DataError, match="not-simulated"):
-        read_sky(tmp_path)
 
 
 # --- keywords of the imitated instrument ---
@@ -450,25 +423,13 @@ def test_aia_171_has_the_keywords_of_aia(tmp_path: Path) -> None:
     assert transit.plate_scale_arcsec == pytest.approx(0.599489, abs=1e-6)
 
 
-def test_real_aia_files_have_these_keywords(shared: Path) -> None:
-    header = fits.getheader(shared / "data/real/aia/aia_171_cutout_20130310.fits", 1)
-    assert {key: header[key] for key in REAL_AIA_171} == REAL_AIA_171
-    assert "DETECTOR" not in header and "GAINCOMB" not in header
-    assert header["CDELT1"] == pytest.approx(
-        imitated(load_instrument("aia_171")).plate_scale_arcsec, abs=1e-5
-    )
-
-
-def test_hri_euv_has_the_keywords_of_eui(tmp_path: Path) -> None:
+def test_hri_euv_and_another_instrument_have_their_own_keywords(tmp_path: Path) -> None:
     assert imitated(load_instrument("hri_euv")) == HRI_EUV
     header = written(tmp_path, "hri_euv")
     assert (header["TELESCOP"], header["INSTRUME"]) == ("SOLO/EUI/HRI_EUV", "EUI")
     assert (header["DETECTOR"], header["WAVELNTH"], header["CDELT1"]) == ("HRI_EUV", 174, 0.492)
     assert header["GAINCOMB"] == "combined" and header["XPOSURE"] == 5.0
     assert load_instrument("hri_euv").detector.plate_scale_arcsec == HRI_EUV.plate_scale_arcsec
-
-
-def test_another_instrument_has_the_keywords_that_its_file_matches(tmp_path: Path) -> None:
     path = tmp_path / "own.toml"
     path.write_text(SMALL_INSTRUMENT)
     instrument = load_instrument(path)

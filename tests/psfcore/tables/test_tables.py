@@ -40,7 +40,7 @@ def fitted(covariance: np.ndarray) -> Psf:
     return make_psf(scattering(), components=parts, fitted=shape)
 
 
-def test_the_radii_are_the_same_for_every_psf_and_end_at_its_reach() -> None:
+def test_the_tables_have_their_fields_and_the_same_radii_for_every_psf() -> None:
     large, small = table_radii(1448.2), table_radii(90.5)
     assert (np.diff(large) > 0).all() and large[-1] == 1448.2 and small[-1] == 90.5
     assert set(small[:-1]) <= set(large) and set(range(101)) <= set(large) and set(range(91)) <= set(small)
@@ -50,9 +50,6 @@ def test_the_radii_are_the_same_for_every_psf_and_end_at_its_reach() -> None:
     beyond = large[large > 100]
     assert (beyond[1:] / beyond[:-1]).max() < 1.03
     assert table_radii(0.0).tolist() == [0.0]
-
-
-def test_the_tables_have_the_fields_of_the_layout() -> None:
     tables = tables_of(make_psf(delta(9)))
     names = "schema name version shape sum central_weight reach_px plate_scale_arcsec radii_px exact_to_px"
     assert list(tables) == [
@@ -97,9 +94,6 @@ def test_the_stated_interpolation_error_covers_the_true_one() -> None:
     assert f"{100 * said:.2f} points" in psf_lookup.curve(tables)["resolution"]
     smooth = tables_of(make_psf(scattering()))
     assert smooth["interpolation_error"]["TOTAL"] < 1e-3
-
-
-def test_an_array_beyond_the_full_reach_has_no_negative_light_beyond() -> None:
     kernel = np.pad(gaussian(2048, 3.0), 50)
     kernel[0, 0] = 5e-4  # farther than 1448 px
     said = psf_lookup.curve(tables_of(make_psf(kernel)))["light_beyond_pct"]["TOTAL"]
@@ -118,9 +112,6 @@ def test_errors_follow_the_covariance_and_its_correlations() -> None:
     assert found["sigma"] == {k: pytest.approx(wanted, rel=1e-3) for k in ("TOTAL", "SCATTER")}
     curve = psf_lookup.curve(tables, [5, 60])["sigma_points"]["TOTAL"]
     assert math.hypot(*curve) / 100 > 1.15 * wanted  # the error if both were independent
-
-
-def test_errors_of_a_full_covariance_are_linear_propagation() -> None:
     covariance = np.array([[0.0025, 0.0009, 0.0], [0.0009, 0.0016, -0.0004], [0.0, -0.0004, 0.0009]])
     radii = np.array([1.0, 10.0, 57.0, 100.0])
     slopes = []
@@ -162,9 +153,6 @@ def test_two_psfs_are_compared_at_their_common_radii() -> None:
     assert found["difference_of_sums"] == pytest.approx(less.sum() - scattering().sum())
     assert found["difference_of_central_weights"] > 0
     assert psf_lookup.compare(one, one)["largest_points"]["TOTAL"] == 0
-
-
-def test_bad_questions_are_refused() -> None:
     tables = tables_of(make_psf(scattering(), plate_scale_arcsec=0.5))
     other = tables_of(make_psf(scattering(), plate_scale_arcsec=0.6))
     cases = [

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,12 +11,10 @@ from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import Convolver
 from psfcore.errors import DataError
-from psfcore.fits.blocks import FitsLimits
 from psfcore.noise import Noise
 from psfcore.psf import cumulative_curve
 from psfcore.transit.first_guess import ESTIMATORS, first_guess
-from psfcore.transit.folder import read_transit
-from psfcore.transit.transit import Frame, Place, Transit
+from psfcore.transit.transit import Frame, Place, Transit, folds
 
 SIZE = 160
 RADIUS_PX = 6.0
@@ -72,7 +69,9 @@ def two_pointings() -> Transit:
     )
 
 
-def test_for_a_homogeneous_sun_it_is_the_light_beyond_the_radius(two_pointings: Transit) -> None:
+def test_for_a_homogeneous_sun_it_is_the_light_beyond_the_radius(
+    two_pointings: Transit,
+) -> None:
     guess = first_guess(two_pointings)
     truth = float(cumulative_curve(wide_kernel(), RADIUS_PX)) / 100
     assert 0.1 < truth < 0.3
@@ -87,6 +86,18 @@ def test_for_a_homogeneous_sun_it_is_the_light_beyond_the_radius(two_pointings: 
     content = json.loads(json.dumps(guess.to_json(), allow_nan=False))
     assert [frame["time_s"] for frame in content["frames"]] == [60.0 * i for i in range(6)]
     assert set(content["frames"][0]["ratio"]) == set(ESTIMATORS)
+    frame = two_pointings.frames[4]
+    pixels, filled = frame.pixels.copy(), np.zeros(frame.pixels.shape, dtype=bool)
+    filled[80, round(frame.place.x_px)] = filled[80, round(frame.place.x_px) + 20] = True
+    pixels[filled] = 1e4
+    marked = Transit(
+        frames=(Frame("a", pixels, 1, frame.place, 1.0, 0.0, filled=filled),),
+        diffraction=wide_kernel(),
+        noise=Noise(1.0, 1.0),
+    )
+    assert first_guess(marked).frames[0].centre_dn_s == pytest.approx(
+        first_guess(two_pointings).frames[4].centre_dn_s, rel=0.01
+    )
 
 
 def test_the_estimators_agree_with_their_names() -> None:
@@ -102,21 +113,6 @@ def test_the_estimators_agree_with_their_names() -> None:
     assert frame.ratio == pytest.approx({"image_mean": 30 / pixels.mean(), "image_median": 0.5, "shell": 0.3})
 
 
-def test_filled_pixels_are_not_used(two_pointings: Transit) -> None:
-    frame = two_pointings.frames[4]
-    pixels, filled = frame.pixels.copy(), np.zeros(frame.pixels.shape, dtype=bool)
-    filled[80, round(frame.place.x_px)] = filled[80, round(frame.place.x_px) + 20] = True
-    pixels[filled] = 1e4
-    marked = Transit(
-        frames=(Frame("a", pixels, 1, frame.place, 1.0, 0.0, filled=filled),),
-        diffraction=wide_kernel(),
-        noise=Noise(1.0, 1.0),
-    )
-    assert first_guess(marked).frames[0].centre_dn_s == pytest.approx(
-        first_guess(two_pointings).frames[4].centre_dn_s, rel=0.01
-    )
-
-
 def test_missing_ratios_are_null(two_pointings: Transit) -> None:
     """An occulter whose centre is outside the frame, and a frame without light."""
     frame = two_pointings.frames[4]
@@ -130,16 +126,25 @@ def test_missing_ratios_are_null(two_pointings: Transit) -> None:
     assert content["frames"][1]["ratio"] == dict.fromkeys(ESTIMATORS)
     assert content["pointings"][2]["inhomogeneity"] is None
     json.dumps(content, allow_nan=False)
-    with pytest.raises(DataError) as caught:
+    with pytest.raises(DataError, match="no-first-guess"):
         first_guess(transit_of(outside, night))
-    assert caught.value.code == "no-first-guess"
 
 
-def test_the_first_guess_of_the_practice_transit_agrees_with_its_truth(shared: Path) -> None:
-    """p1 was made without any effect; the cumulative curve of its PSF at the occulter's radius is known."""
-    folder = shared / "data/practice/p1"
-    guess = first_guess(read_transit(folder, FitsLimits(max_pixels=1024 * 1024)))
-    truth = json.loads((folder.parent / "p1.truth.json").read_text())["psf"]
-    assert guess.best_pointing == 2 and guess.radius_px == 10.75
-    assert 0.5 * truth["total"] < guess.share < 1.5 * truth["total"]
-    assert guess.share_spread < 0.5 * guess.share
+# --- held-out blocks and their guard ---
+
+
+def test_blocks_and_guard() -> None:
+    for images, blocks, guard in (
+        (126, 10, 3), (84, 10, 2), (30, 10, 1), (12, 4, 1), (11, 3, 0), (6, 2, 0), (250, 10, 6)
+    ):  # fmt: skip
+        found = folds(images)
+        assert len(found) == blocks
+        assert [k for fold in found for k in fold.held_out] == list(range(images))  # each once, in order
+        sizes = [len(fold.held_out) for fold in found]
+        assert max(sizes) - min(sizes) <= 1 and min(sizes) >= 3
+        for fold in found:
+            first, last = fold.held_out[0], fold.held_out[-1]
+            around = range(max(0, first - guard), min(images, last + guard + 1))
+            assert fold.held_out == tuple(range(first, last + 1))
+            assert fold.fitted == tuple(k for k in range(images) if k not in around)
+    assert [folds(images) for images in range(6)] == [()] * 6, "too few images for two blocks"

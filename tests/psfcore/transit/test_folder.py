@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from psfcore.errors import DataError, HeaderError
 from psfcore.fits.blocks import FitsLimits
 from psfcore.noise import Noise
 from psfcore.transit.folder import checked_kernel, read_prepared, read_transit
+from tests.psfcore.conftest import gaussian as smooth
 from tests.transit_files import (
     SHAPE,
     SPOT,
@@ -49,10 +51,7 @@ def change_image(folder: Path, index: int, **values: object) -> None:
     save_manifest(folder, content)
 
 
-def gaussian(n: int) -> Flat:
-    y, x = np.indices((n, n)) - n // 2
-    kernel = np.exp(-0.5 * (x * x + y * y) / 1.5**2)
-    return np.asarray(kernel / kernel.sum())
+gaussian = partial(smooth, sigma_px=1.5)
 
 
 # --- what is read -----------------------------------------------------------------------------------------
@@ -79,19 +78,16 @@ def test_a_transit_is_read_in_dn_per_second(folder: Path) -> None:
             frame.pixels[far], true_rate(frame.pointing)[far], atol=0.51
         )  # whole DN are stored
         assert np.allclose(frame.pixels[20, round(frame.place.x_px)], 10, atol=0.51)
+    dn = transit.frames[0].pixels
     names = {path.name for path in folder.iterdir()}
     assert transit.sha256 == {
         name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names
     }
-
-
-def test_pixels_in_dn_per_second_stay(folder: Path) -> None:
-    dn = read_transit(folder, LIMITS).frames[0].pixels
     write_transit(folder, cards={"BUNIT": "DN / s"})
-    assert np.array_equal(read_transit(folder, LIMITS).frames[0].pixels, 2 * dn)
+    assert np.array_equal(read_transit(folder, LIMITS).frames[0].pixels, 2 * dn), "DN/s stay"
 
 
-def test_frames_are_sorted_by_time_then_by_the_manifest(folder: Path) -> None:
+def test_frames_are_sorted_by_time_or_without_dates_by_the_manifest(folder: Path) -> None:
     dates = {0: "2023-01-03T05:00:00Z", 4: "2023-01-03T04:01:00.000", 5: "2023-01-03T03:59:30"}
     for index, date in dates.items():
         write_frame(folder / f"{index:03d}.fits", index, 1 + index // 3, {"DATE-BEG": date})
@@ -99,9 +95,6 @@ def test_frames_are_sorted_by_time_then_by_the_manifest(folder: Path) -> None:
     assert [frame.file[:3] for frame in frames] == ["005", "001", "004", "002", "003", "000"]
     assert [frame.time_s for frame in frames] == [0, 90, 90, 150, 210, 3630]
     assert [frame.place.x_px for frame in frames] == [place_of(i)[0] for i in (5, 1, 4, 2, 3, 0)]
-
-
-def test_without_dates_the_order_of_the_manifest_is_used_and_date_obs_replaces_date_beg(folder: Path) -> None:
     for date in (None, "yesterday", "2023-01-03T25:00:00"):
         write_frame(folder / "003.fits", 3, 2, {"DATE-BEG": date})
         frames = read_transit(folder, LIMITS).frames
@@ -111,15 +104,12 @@ def test_without_dates_the_order_of_the_manifest_is_used_and_date_obs_replaces_d
     assert [frame.time_s for frame in read_transit(folder, LIMITS).frames] == [0.0] * 6
 
 
-def test_given_noise_replaces_that_of_the_manifest(folder: Path) -> None:
+def test_noise_and_instrument_come_from_call_manifest_or_headers(folder: Path) -> None:
     assert read_transit(folder, LIMITS, noise=Noise(1.0, 0.5)).noise == Noise(1.0, 0.5)
     write_transit(folder, noise=None)
     assert read_transit(folder, LIMITS, noise=Noise(1.0, 0.5)).noise == Noise(1.0, 0.5)
     message = refusal(folder, "no-noise-figures")
     assert "photon_gain_dn" in message and "read_noise_dn" in message
-
-
-def test_without_an_instrument_in_the_manifest_the_headers_decide(folder: Path) -> None:
     write_transit(folder, instrument=None)
     assert read_transit(folder, LIMITS).instrument == "hri_euv"
     write_transit(folder, instrument=None, cards={"DETECTOR": "other"})
@@ -271,18 +261,3 @@ def test_unusable_files_are_refused(folder: Path) -> None:
     assert caught.value.code == "too-many-pixels"
     (folder / "diffraction.fits").write_text("hello")
     assert "diffraction.fits" in refusal(folder, "not-fits")
-
-
-def test_the_practice_transit_is_read(shared: Path) -> None:
-    transit, prepared = read_prepared(shared / "data/practice/p1", LIMITS_PRACTICE)
-    assert len(transit.frames) == 30 and transit.shape == (512, 512)
-    assert transit.diffraction.shape == (1024, 1024) and transit.diffraction.sum() == pytest.approx(1)
-    assert transit.noise == Noise(6.0, 2.0) and transit.plate_scale_arcsec == pytest.approx(0.492)
-    assert [frame.pointing for frame in transit.frames] == [1] * 10 + [2] * 10 + [3] * 10
-    assert all(
-        later.time_s > frame.time_s for frame, later in zip(transit.frames, transit.frames[1:], strict=False)
-    )
-    assert prepared.unfilled == 0 and len(transit.sha256) == 32
-
-
-LIMITS_PRACTICE = FitsLimits(max_pixels=1024 * 1024)

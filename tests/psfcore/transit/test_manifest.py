@@ -34,7 +34,7 @@ def changed(change: Change) -> bytes:
     return json.dumps(content).encode()
 
 
-def test_a_manifest_is_read_as_written() -> None:
+def test_a_manifest_is_read_as_written_with_unknown_keys() -> None:
     manifest = parse_manifest(json.dumps(GOOD).encode())
     assert manifest.instrument == "hri_euv"
     assert manifest.noise is not None and manifest.noise.read_noise_dn == 2.0
@@ -45,8 +45,6 @@ def test_a_manifest_is_read_as_written() -> None:
         "a byte order mark is ignored"
     )
 
-
-def test_optional_keys_may_be_missing_and_unknown_keys_are_ignored() -> None:
     def strip(content: dict[str, Any]) -> None:
         for key in ("instrument", "known_psf", "noise"):
             del content[key]
@@ -76,31 +74,22 @@ WRONG: list[tuple[Change, list[str]]] = [
     (top(schema="transit/2"), ["schema", "transit/1", "transit/2"]),
     (lambda content: content.pop("schema"), ["schema", "no such key"]),
     (top(images=[]), ["images", "at least 1", "got 0"]),
-    (top(images={}), ["images"]),
-    (lambda content: content.pop("images"), ["images", "no such key"]),
     (many, ["images", str(MAX_IMAGES), str(MAX_IMAGES + 1)]),
     (image(1, file="../001.fits"), ["images[1] (../001.fits).file", "plain file name"]),
     (image(1, file="a\0b"), ["images[1]", "plain file name"]),
-    (image(1, file=7), ["images[1]", "got 7"]),
     (image(2, file="000.fits"), ["images[2] (000.fits)", "once", "images[0]"]),
     (image(2, file="diffraction.fits"), ["images[2]", "known PSF"]),
     (image(2, file="transit.json"), ["images[2]", "manifest"]),
     (top(known_psf="transit.json"), ["known_psf"]),
-    (top(known_psf="../psf.fits"), ["known_psf", "plain file name"]),
     (image(2, x=float("nan")), ["images[2] (002.fits).x", "finite"]),
-    (image(2, y=float("inf")), ["images[2] (002.fits).y", "finite"]),
     (image(2, x="12"), ["images[2] (002.fits).x", "got '12'"]),
     (image(2, x=True), ["images[2] (002.fits).x"]),
-    (image(2, x=10**400), ["images[2] (002.fits).x"]),
-    (image(2, y=1e9), ["images[2] (002.fits).y"]),
     (image(2, r=0), ["images[2] (002.fits).r", "greater than 0", "got 0"]),
-    (image(2, r=-1), ["images[2] (002.fits).r"]),
     (image(2, r=1e5), ["images[2] (002.fits).r"]),
     (image(2, fov=1.5), ["images[2] (002.fits).fov"]),
     (lambda content: content["images"][0].pop("r"), ["images[0] (000.fits).r", "no such key"]),
     (lambda content: content["images"].insert(1, None), ["images[1]", "None"]),
     (top(noise={"photon_gain_dn": -1, "read_noise_dn": 2}), ["noise.photon_gain_dn", "-1"]),
-    (top(noise={"photon_gain_dn": 6}), ["noise.read_noise_dn", "no such key"]),
     (top(noise={"photon_gain_dn": 0, "read_noise_dn": 0}), ["noise", "above zero"]),
     (top(instrument="a\0b"), ["instrument", "printable"]),
 ]
@@ -126,9 +115,8 @@ def test_a_wrong_value_is_named_and_other_content_is_refused() -> None:
 
 
 def test_a_folder_without_a_manifest_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError) as caught:
+    with pytest.raises(DataError, match="no-manifest"):
         read_manifest(tmp_path)
-    assert caught.value.code == "no-manifest"
 
 
 def test_plain_names() -> None:

@@ -45,16 +45,12 @@ def exposure(
     )
 
 
-def test_dn_become_dn_per_second() -> None:
+def test_dn_become_dn_per_second_and_pixels_without_gaps_stay_unchanged() -> None:
     rate = true_rate(1)
     read = exposure(2 * rate, unit="dn")
     assert read.exposure_s == 2.0 and read.pixels.dtype == np.float32 and np.allclose(read.pixels, rate)
     with pytest.raises(DataError, match=r"unknown-unit: 0\.fits: "):
         exposure(rate, unit="erg")
-
-
-def test_pixels_without_gaps_stay_unchanged() -> None:
-    rate = true_rate(1)
     frames, prepared = prepare([exposure(rate, time_s=t) for t in (0, 1)])
     assert all(np.array_equal(frame.pixels, rate.astype(np.float32)) for frame in frames)
     assert all(frame.filled is None for frame in frames)
@@ -77,7 +73,7 @@ def test_filled_pixels_are_scaled_to_the_brightness_of_the_frame() -> None:
     assert (counts.saturated, counts.from_frames, counts.from_neighbours, counts.unfilled) == (48, 48, 0, 0)
 
 
-def test_gaps_are_filled_from_the_nearest_frame_of_the_same_pointing() -> None:
+def test_gaps_are_filled_from_the_nearest_frames_of_the_pointing() -> None:
     rate, marked = true_rate(1), [true_rate(1) for _ in range(4)]
     for number, frame in enumerate(marked):
         frame[SPOT] = 2000.0 + number
@@ -93,9 +89,6 @@ def test_gaps_are_filled_from_the_nearest_frame_of_the_same_pointing() -> None:
     )
     assert np.allclose(frames[2].pixels[SPOT], 2001)
     assert np.allclose(frames[4].pixels[SPOT], 2003)
-
-
-def test_gaps_of_the_nearest_frame_are_filled_from_the_next() -> None:
     rate = true_rate(1)
     half = (slice(40, 43), SPOT[1])
     frames, prepared = prepare(
@@ -109,16 +102,12 @@ def test_gaps_of_the_nearest_frame_are_filled_from_the_next() -> None:
     assert prepared.frames[0].from_frames == 48 and prepared.frames[1].from_frames == 24
 
 
-def test_pixels_behind_the_occulter_of_another_frame_are_not_used() -> None:
+def test_pixels_that_no_frame_shows_keep_their_value() -> None:
     rate = true_rate(1)
     over_the_spot = exposure(rate, time_s=10, place=Place(63.5, 42.5, 4.0))
     over_the_spot.pixels[SPOT] = 1.0
     frames, _ = prepare([exposure(rate, saturated=SPOT), over_the_spot, exposure(rate, time_s=99)])
     assert np.allclose(frames[0].pixels[SPOT], 1000)
-
-
-def test_a_saturated_pixel_that_no_frame_shows_keeps_its_value_and_is_marked() -> None:
-    rate = true_rate(1)
     frames, prepared = prepare([exposure(rate, time_s=t, saturated=SPOT) for t in (0, 60)])
     for frame, counts in zip(frames, prepared.frames, strict=True):
         assert (frame.pixels[SPOT] == 500).all()
@@ -142,10 +131,7 @@ def test_nan_is_filled_from_frames_and_else_from_neighbours() -> None:
     huge[3, 3] = 1e60
     frames, prepared = prepare([exposure(huge)])
     assert np.allclose(frames[0].pixels, rate) and prepared.frames[0].nonfinite == 1, "beyond float32"
-
-
-def test_nan_on_the_occulter_stays_dark() -> None:
-    """Another frame shows the Sun at this place."""
+    # Another frame shows the Sun at this place.
     rate = true_rate(1)
     dark = rate.copy()
     y, x = np.indices(SHAPE)

@@ -7,13 +7,10 @@ with its own PSF, is the comparison.
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import linear_convolve
 from psfcore.deconvolve.conditions import Conditions
@@ -79,55 +76,3 @@ def test_the_scatter_fitted_to_the_disc_in_xrt_leaves_what_the_fit_calls_no_scat
     assert (before, total) == (pytest.approx(5.72, abs=0.01), pytest.approx(0.29, abs=0.02))
     assert core == pytest.approx(constant, rel=0.1) and core < 5.44 < before
     assert ring == pytest.approx(ring_before, rel=0.02)
-
-
-Vector = NDArray[np.float64]
-
-
-def epochs_of_aia(shared: Path) -> tuple[Vector, dict[str, Vector]]:
-    """The light that remains in the disc (DN) at 32 epochs in AIA 193, deconvolved with the standard PSF, which has no long-range
-    scatter; and terms that may explain it, scaled to a mean (or a step) of 1."""
-    with (shared / "data/real/occultation/aia193_venus_residuals.csv").open() as lines:
-        rows = list(csv.DictReader(lines))
-    column = {name: np.array([float(row[name]) for row in rows]) for name in rows[0] if name != "time"}
-    order = np.linspace(-0.5, 0.5, len(rows))
-    ring, disk = column["annulus_DN_after_std_psf"], column["fulldisk_DN"]
-    # About every other image has 5 % more light over the whole disk: there are two kinds of images.
-    brighter = (disk > np.polyval(np.polyfit(order, disk, 1), order)).astype(float)
-    return column["core_DN_after_std_psf"], {
-        "level": np.ones(len(rows)),
-        "ring": ring / ring.mean(),
-        "full disk": disk / disk.mean(),
-        "kind of image": brighter - brighter.mean(),
-    }
-
-
-def explained(
-    core: Vector, terms: dict[str, Vector], chosen: Sequence[str]
-) -> tuple[dict[str, tuple[float, float]], float, float]:
-    """Fit core = sum over terms of weight x term by least squares: the weight of each term with its error (DN), the rms error of
-    held-out epochs (DN), and BIC = n ln(rss / n) + k ln n."""
-    design = np.array([terms[name] for name in chosen]).T
-    inverse = np.linalg.inv(design.T @ design)
-    weights = inverse @ design.T @ core
-    left, (n, k) = core - design @ weights, design.shape
-    sigma = np.sqrt(np.diag(inverse) * float(left @ left) / (n - k))
-    lever = np.einsum("ni,ij,nj->n", design, inverse, design)
-    fitted = {name: (float(w), float(s)) for name, w, s in zip(chosen, weights, sigma, strict=True)}
-    bic = float(n * np.log(left @ left / n) + k * np.log(n))
-    return fitted, float(np.sqrt(np.mean((left / (1 - lever)) ** 2))), bic
-
-
-def test_without_long_range_scatter_the_gap_is_a_constant_plus_a_share_of_the_ring(shared: Path) -> None:
-    core, terms = epochs_of_aia(shared)
-    _, level_rms, _ = explained(core, terms, ["level"])
-    weights, both_rms, both_bic = explained(core, terms, ["level", "ring"])
-    weight, sigma = weights["ring"]
-    assert weight > 4 * sigma and both_rms < level_rms
-    # A constant and a share of the full disk, whose light hardly changes, cannot be told apart.
-    _, _, other_bic = explained(core, terms, ["full disk", "ring"])
-    assert abs(other_bic - both_bic) < 6
-    # Two ways of taking images differ by more than their light does: no scatter does that.
-    weights, _, _ = explained(core, terms, ["level", "ring", "kind of image"])
-    weight, sigma = weights["kind of image"]
-    assert weight > 3 * sigma and weight / core.mean() > 0.15

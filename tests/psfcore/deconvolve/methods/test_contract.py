@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 from importlib import import_module
-from types import SimpleNamespace
 from typing import Any, get_args
 
 import numpy as np
 import pytest
 
 from psfcore.deconvolve import extent
-from psfcore.deconvolve.conditions import Conditions, Deconvolved
-from psfcore.deconvolve.methods.linear import METHOD, Additive
+from psfcore.deconvolve.conditions import Conditions
 from psfcore.deconvolve.methods.registry import method_names
-from psfcore.deconvolve.problem import pose
-from psfcore.image import Image
-from psfcore.psf import Psf
 from psfcore.simulate.scene import observe, solar_scene
 from tests.psfcore.conftest import gaussian, make_image, make_psf
 from workers.contract.requests import Method
@@ -58,20 +53,3 @@ def _approaches(module: Any) -> bool:
 def test_a_method_has_all_that_it_needs(name: str) -> None:
     module = import_module(f"psfcore.deconvolve.methods.{name.replace('-', '_')}")
     assert faults(name, module) == []
-
-
-def unscaled(
-    image: Image, psf: Psf, conditions: Conditions, *, steps: int = 5, stop: str = "fixed"
-) -> Deconvolved:
-    """The step x + (y - H x), with a filter that its author forgot to divide by the scale of the transform."""
-    problem = pose(METHOD, image, psf, conditions, steps=steps, stop="fixed")
-    step_filter = np.ones_like(problem.engine.transfer[:, :, :1])
-    return problem.solve(Additive(problem, step_filter))
-
-
-def test_each_thing_that_is_missing_is_told_by_its_name() -> None:
-    empty = faults("my-method", SimpleNamespace())
-    for thing in ("MARGIN_SHARE", "WORKING_BYTES", "benchmarks.estimates", "requests.py"):
-        assert any(thing in sentence for sentence in empty), thing
-    whole = SimpleNamespace(deconvolve=unscaled)
-    assert ["transfer_scale" in sentence for sentence in faults("linear", whole)] == [True]

@@ -133,16 +133,13 @@ def test_single_precision_follows_the_plain_version(seen: Plane, psf: Psf) -> No
         assert np.abs(single - double).max() < allowed * double.max(), (name, more)
 
 
-def test_linear_converges_to_a_model_equal_to_the_image(seen: Plane, psf: Psf) -> None:
+def test_linear_methods_converge_and_amplify_noise_as_stated(seen: Plane, psf: Psf) -> None:
     """After five steps x solves H x = y, checked with a convolution in float64, for an asymmetric PSF too."""
     for one in (psf, make_psf(lopsided((65, 65)))):
         pixels = method_named("linear")(make_image(seen), one, ZERO).pixels
         model = Convolver(one.kernel, seen.shape, dtype=np.float64).apply(pixels)
         assert np.abs(model - seen).max() < 1e-4 * seen.max()
-
-
-def test_linear_methods_are_linear_and_amplify_noise_as_stated(psf: Psf) -> None:
-    """They keep negative light."""
+    # They keep negative light.
     rng = np.random.default_rng(1)
     noise, other = rng.normal(0, 1, (384, 384)), rng.normal(3, 1, (384, 384))
     for name in LINEAR:

@@ -23,7 +23,9 @@ from tests.psfcore.gap.linear_models import (
 )
 
 
-def test_a_fit_finds_values_errors_and_units(evidence: Evidence) -> None:
+def test_a_fit_finds_values_errors_units_and_names(
+    evidence: Evidence,
+) -> None:
     model = with_residuals(evidence, {"dark_offset": 3.0})
     dark = effect_of(evidence, "dark_offset")
     fit = fit_effects(model, [dark])
@@ -40,11 +42,6 @@ def test_a_fit_finds_values_errors_and_units(evidence: Evidence) -> None:
     assert once.p_value == pytest.approx(float(chi2.sf(once.gain, 1)))
     assert fit_effects(model, [replace(dark, trials=100)]).p_value == pytest.approx(100 * once.p_value)
     assert fit_effects(model, [replace(dark, trials=10**9)]).p_value == 1.0
-
-
-def test_parameters_of_effects_that_are_fitted_together_have_the_name_of_their_effect(
-    evidence: Evidence,
-) -> None:
     strong = {name: 20 * sigma_of(evidence, name) for name in ("dark_offset", "column_smear")}
     model = with_residuals(evidence, strong)
     both = fit_effects(model, evidence.effects)

@@ -139,14 +139,13 @@ def test_a_field_takes_the_place_of_the_effect_with_its_name(evidence: Evidence)
     assert [effect.name for effect in other.effects] == [*names, *UNKNOWN]
 
 
-def test_a_change_of_the_psf_leaves_an_image_without_a_disc_as_it_is(evidence: Evidence) -> None:
+def test_data_have_only_the_fields_that_they_can_show(
+    evidence: Evidence,
+) -> None:
     lost = evidence.discs[0].index
     columns = FieldColumns(replace(evidence, discs=evidence.discs[1:]))
     assert not columns.planes(Field("optics", "kernel"), lost).any()
     assert columns.planes(Field("optics", "kernel"), evidence.discs[1].index).any()
-
-
-def test_data_have_only_the_fields_that_they_can_show(evidence: Evidence) -> None:
     one = tuple(replace(info, pointing=1, exposure_s=1.0) for info in evidence.image_info)
     forms = {field.form for field in fields_of(replace(evidence, image_info=one))}
     assert "dark" not in forms and "light_in_pointing" not in forms

@@ -223,7 +223,9 @@ def test_the_curvature_is_that_of_the_scatter_kernel() -> None:
         assert max(bent for _, bent in curvatures) < likelihoods.MOST_CURVATURE, law
 
 
-def test_a_long_step_of_the_psf_is_not_linear(evidence: Evidence) -> None:
+def test_what_a_long_step_and_a_misfit_of_all_hypotheses_change(
+    evidence: Evidence,
+) -> None:
     """The curvature of the PSF grows with the fourth power of the step: with its relative error and its change. A very long step
     is at most wrong by a fixed part of its change, for example along a coordinate that hardly matters."""
     longest, base = float(evidence.longest_step[0]), evidence.base[0]
@@ -236,10 +238,7 @@ def test_a_long_step_of_the_psf_is_not_linear(evidence: Evidence) -> None:
     assert visible(0.0) == 0 < visible(0.1)
     assert visible(1.0) / visible(0.1) == pytest.approx(1e4, rel=0.01)
     assert visible(2000.0) / visible(1000.0) == pytest.approx(4, rel=0.01)
-
-
-def test_a_misfit_that_every_hypothesis_has_decides_less(evidence: Evidence) -> None:
-    """An offset beside residuals that no column describes: the larger these are, the less the offset counts."""
+    # An offset beside residuals that no column describes: the larger these are, the less the offset counts.
     rng = np.random.default_rng(2)
     sigma = sigma_of(evidence, "dark_offset")
     plain = replace(with_residuals(evidence, {"dark_offset": 8 * sigma}), scale_error=0.1)

@@ -9,11 +9,14 @@ import pytest
 import scipy.linalg
 from scipy.stats import multivariate_normal
 
+from psfcore.gap.evidence.cells import cells_of, disc_cells, sensitivities
 from psfcore.gap.evidence.effect_fits import means
 from psfcore.gap.evidence.evidence import Evidence, gather
 from psfcore.gap.evidence.linear_model import FLOOR, UNLIKELY, LinearModel
 from psfcore.gap.library.detector import EFFECTS
+from psfcore.gap.view import View
 from psfcore.scatter.reconstruction import Solution
+from psfcore.scatter.total_psf import pick, put
 from tests.psfcore.gap.linear_models import dense, discs_only, effect_of, with_residuals
 
 
@@ -91,3 +94,54 @@ def test_blocks_recover_an_added_effect_whatever_the_brightness(evidence: Eviden
     equations = (one.equations([column]) for one in (added, blocks))
     after, before = (float(one.score[0] / one.normal[0, 0]) for one in equations)
     assert after - before == pytest.approx(1.5, abs=0.15)
+
+
+# --- cells and sensitivities, compared with the estimate computed forwards ---
+
+
+def left_in_disc(solution: Solution, n: int, image: np.ndarray) -> np.ndarray:
+    """r of Eq. (1) of cells, computed forwards."""
+    optics, dark = solution.optics, solution.sky.dark[n]
+    lanes = optics.lanes(np.ascontiguousarray(image, dtype=np.float32))
+    scene = optics.invert(lanes, optics.invert_once(lanes), steps=1)
+    put(scene, dark, 0.0)
+    return pick(lanes, dark) - pick(optics.convolve(scene), dark)
+
+
+def test_a_sensitivity_of_a_cell_is_the_adjoint_of_the_estimate(
+    solution: Solution,
+) -> None:
+    n = solution.part[3]
+    place = solution.sky.found[n].place
+    cells = cells_of(solution.sky.dark[n], place.x_px, place.y_px)
+    assert cells.pixels.sum() == solution.sky.dark[n][0].size
+    assert np.allclose(cells.weights.sum(axis=1), 1.0)
+    assert cells.pixels.size == 13 and cells.radius.max() < 1.0
+    planes = sensitivities(solution.optics, solution.sky.dark[n], cells.weights)
+    image = np.random.default_rng(1).normal(size=solution.transit.shape).astype(np.float32)
+    forwards = cells.weights @ left_in_disc(solution, n, image)
+    backwards = np.einsum("cyx,yx->c", planes, image)
+    assert backwards == pytest.approx(forwards, abs=1e-4)
+
+
+def test_sensitivities_predict_an_added_error_and_no_global_gain(
+    solution: Solution,
+) -> None:
+    n = solution.part[3]
+    found, planes = disc_cells(solution, n)
+    error = np.full(solution.transit.shape, 5.0, np.float32)
+    place = solution.sky.found[n].place
+    weights = cells_of(solution.sky.dark[n], place.x_px, place.y_px).weights
+    optics, dark = solution.optics, solution.sky.dark[n]
+    lanes = optics.lanes(solution.transit.frames[n].pixels + error)
+    scene = optics.invert(lanes, steps=8)
+    put(scene, dark, 0.0)
+    after = weights @ (pick(lanes, dark) - pick(optics.convolve(scene), dark))
+    expected = np.einsum("cyx,yx->c", planes, error)
+    assert np.abs(expected).max() > 0.5
+    assert after - found.residual == pytest.approx(expected, abs=0.05 * float(np.abs(expected).max()))
+    view = View(solution)
+    n = solution.part[2]
+    found, planes = disc_cells(solution, n)
+    moved = np.einsum("cyx,yx->c", planes, view.expected[n])
+    assert np.abs(moved).max() < 0.01 * float(found.expected.mean())

@@ -83,6 +83,8 @@ def test_the_gain_of_a_change_of_the_psf_is_that_of_the_whole_field() -> None:
             gain_by_hand(change, False), rel=0.1, abs=0.1
         )
     assert search.kernels([kernel, -kernel]).max() > 0.01
+    for gains, number in (([3, 3, 3], 1.0), ([80, 0, 0, 0], 4.0), ([80, 80, 0, 0], 2.0), ([7], 1.0)):
+        assert distinguished(np.array(gains, dtype=float)) == pytest.approx(number), gains
 
 
 def test_a_blur_is_not_negative_and_has_its_nominal_width() -> None:
@@ -185,11 +187,6 @@ def test_a_changing_sun_shows_only_in_the_unocculted_field() -> None:
         assert set(sun.values) == ({"rms"} if share > 0 else set())
 
 
-def test_templates_that_explain_the_data_equally_well_are_not_distinguished() -> None:
-    for gains, number in (([3, 3, 3], 1.0), ([80, 0, 0, 0], 4.0), ([80, 80, 0, 0], 2.0), ([7], 1.0)):
-        assert distinguished(np.array(gains, dtype=float)) == pytest.approx(number), gains
-
-
 def test_a_copy_is_found_at_its_place_with_its_blur() -> None:
     transit = changed(
         clean(), lambda n, f: f.pixels + 0.06 * displaced(gaussian_filter(f.pixels, 8.0), 24, 16)
@@ -228,7 +225,7 @@ def by_whole_field(image: np.ndarray, n: int) -> np.ndarray:
     return np.asarray(moved - level * float(level @ moved) / float(level @ level))
 
 
-def test_sums_over_displacements_match_the_definition() -> None:
+def test_sums_over_displacements_and_whitening_match_their_definitions() -> None:
     rng = np.random.default_rng(1)
     planes, scene, reach = rng.normal(size=(2, 6, 7)), rng.normal(size=(12, 13)), 3
     sums = correlations(planes, scene, reach)
@@ -237,16 +234,18 @@ def test_sums_over_displacements_match_the_definition() -> None:
             there = scene[reach - dy : reach - dy + 6, reach - dx : reach - dx + 7]
             by_hand = (planes * there).sum(axis=(1, 2))
             assert sums[:, reach + dy, reach + dx] == pytest.approx(by_hand)
+    assert not whitening(np.zeros((3, 3))).any()
+    row = np.array([1.0, 2.0, -1.0])
+    white = whitening(np.outer(row, row))
+    assert np.isfinite(white).all()
+    assert np.linalg.norm(white @ row) == pytest.approx(1.0)
 
 
-def test_a_patch_is_zero_outside_the_field() -> None:
+def test_a_patch_gives_the_same_response_as_the_whole_field() -> None:
     plane = np.arange(20.0).reshape(4, 5)
     assert cut(plane, -1, 3, (3, 3)).tolist() == [[0, 0, 0], [3, 4, 0], [8, 9, 0]]
     assert cut(plane, 2, -1, (2, 3)).tolist() == [[0, 10, 11], [0, 15, 16]]
     assert not cut(plane, 7, 0, (3, 3)).any() and not cut(plane, 0, -9, (3, 3)).any()
-
-
-def test_a_patch_gives_the_same_response_as_the_whole_field() -> None:
     kernel = crop_or_pad(view().kernel, 129)
     change = along_line(kernel) - kernel
     shape = solution().transit.shape
@@ -262,9 +261,6 @@ def test_a_patch_gives_the_same_response_as_the_whole_field() -> None:
             # A copy is light all over the field, and what scatters in from beyond the patch is left out.
             left = around[:, 2 + dy, 2 + dx] - whole
             assert np.linalg.norm(left) < 0.5 * np.linalg.norm(whole)
-
-
-def test_a_field_smaller_than_a_patch_is_used_whole() -> None:
     plan = default_plan(12, 76, oversampling=1, brightness=8.0)
     small = View(fit(simulate(plan, TRUTH, diffraction(), seed=3).transit))
     shape, n = small.solution.transit.shape, small.solution.part[0]
@@ -273,11 +269,3 @@ def test_a_field_smaller_than_a_patch_is_used_whole() -> None:
     moved = disc.of_copies(small.blurred(n, Blur(change, shape)), 0, 0, 0)[:, 0, 0]
     assert disc.residual.shape == moved.shape
     assert np.linalg.norm(disc.of_kernel(change) - moved) < 0.05 * np.linalg.norm(moved)
-
-
-def test_whitening_handles_cells_without_independent_noise() -> None:
-    assert not whitening(np.zeros((3, 3))).any()
-    row = np.array([1.0, 2.0, -1.0])
-    white = whitening(np.outer(row, row))
-    assert np.isfinite(white).all()
-    assert np.linalg.norm(white @ row) == pytest.approx(1.0)

@@ -50,9 +50,17 @@ def test_the_effects_of_a_file_follow_the_library_and_have_its_hash(tmp_path: Pa
     assert by_place[-1][1] > 3 * abs(by_place[0][1])
 
 
-def test_a_module_also_works_and_a_changed_file_is_reloaded(
+def test_modules_changed_files_and_the_examples_of_the_documentation(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    text = "from __future__ import annotations\nfrom dataclasses import dataclass, KW_ONLY\n"
+    text += GLOW + "\n@dataclass\nclass Lamp:\n    _: KW_ONLY\n    watts: float = 1.0\n"
+    assert gap.__doc__ is not None
+    indented = "\n".join(line[4:] for line in gap.__doc__.splitlines() if line.startswith("    "))
+    codes = re.findall(r"```python\n(.*?)```", DOCUMENTATION.read_text("utf-8"), re.S)
+    (in_page,) = (code for code in codes if "EFFECTS" in code)
+    for example in (text, indented, in_page):
+        assert one_of(source_in(tmp_path, example)).name == "edge_glow"
     module = "my_effects_module"
     source_in(tmp_path, name=f"{module}.py")
     monkeypatch.syspath_prepend(tmp_path)
@@ -65,29 +73,15 @@ def test_a_module_also_works_and_a_changed_file_is_reloaded(
         assert one_of(source_in(tmp_path, GLOW.replace("edge_glow", name))).name == name
 
 
-def test_a_file_may_define_dataclasses_and_the_examples_of_the_documentation_work(tmp_path: Path) -> None:
-    text = "from __future__ import annotations\nfrom dataclasses import dataclass, KW_ONLY\n"
-    text += GLOW + "\n@dataclass\nclass Lamp:\n    _: KW_ONLY\n    watts: float = 1.0\n"
-    assert gap.__doc__ is not None
-    indented = "\n".join(line[4:] for line in gap.__doc__.splitlines() if line.startswith("    "))
-    codes = re.findall(r"```python\n(.*?)```", DOCUMENTATION.read_text("utf-8"), re.S)
-    (in_page,) = (code for code in codes if "EFFECTS" in code)
-    for example in (text, indented, in_page):
-        assert one_of(source_in(tmp_path, example)).name == "edge_glow"
-
-
 def test_an_error_in_a_source_is_reported_with_its_name(tmp_path: Path) -> None:
     texts = {
         "": "got no variable of this name",
         "EFFECTS = ()": "got an empty tuple or list",
-        "EFFECTS = (1, 'a')": "got a tuple or list of int, str",
         "EFFECTS = 3": "got int",
         "EFFECTS = (": "SyntaxError",
-        "import no_such_module_anywhere": "No module named 'no_such_module_anywhere' (line 1)",
         "x = 1\ny = x + z\n": "NameError: name 'z' is not defined (line 2)",
         GLOW.replace('"a dark exposure", ', ""): "missing 1 required positional argument",
         GLOW.replace("edge_glow", "edge glow"): "letters, digits and _; got 'edge glow'",
-        GLOW.replace("edge_glow", "dark_offset"): "got 'dark_offset' twice",
         GLOW.replace(
             '(EffectParameter("height", "DN/s", 5.0),)', "()"
         ): "edge_glow: expected at least one parameter",
@@ -98,7 +92,7 @@ def test_an_error_in_a_source_is_reported_with_its_name(tmp_path: Path) -> None:
             added_effects([source])
         assert refusal.value.code == "bad-effects"
         assert said in refusal.value.message and source in refusal.value.message, text
-    for source in ("nowhere.py", "no_such_module_anywhere", "no_such.module", "sys", "..relative", ""):
+    for source in ("nowhere.py", "no_such_module", "no_such.module", "sys", "..relative", ""):
         with pytest.raises(DataError, match=f"effects of {source}") as refusal:
             added_effects([source])
         assert refusal.value.code == "bad-effects"

@@ -16,7 +16,7 @@ from psfcore.drawing.page import with_error
 from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.report import plot as gap_plot
 from psfcore.gap.report.page import gap_page, interval_words, unit_words
-from psfcore.gap.report.plot import cell_means, draw_cells, draw_effects, draw_map, gap_png, simulated_of
+from psfcore.gap.report.plot import cell_means, draw_effects, draw_map, gap_png, simulated_of
 from psfcore.gap.report.report import gap_report, hypothesis_words, percent_words
 from psfcore.gap.verdict.limits import Alike
 from psfcore.gap.verdict.posterior import UNKNOWN
@@ -26,25 +26,14 @@ from tests.psfcore.gap.posteriors import FIELD
 from tests.psfcore.gap.report.judged import (
     HOLDS_FOR,
     LEAST,
-    OFFSET,
     OFFSET_BLUR,
-    OFFSET_GAIN,
     SHARES,
     judged,
-    with_shares,
 )
 from tests.psfcore.gap.small_gaps import OFFSET_DN, found
 
 MADE_BY = {"software_version": "1.2.3", "seed": 5, "libraries": {"numpy": "9.9"}, "started_from_psf": None}
 EFFECT_COLUMNS = 7  # of the table of effects; the other tables that begin with an effect have fewer columns
-# What the page of each verdict says about it.
-TOLD = {
-    "none": "Most probably there is no gap",
-    "attributed": "To confirm the named effects, take a dark exposure",
-    "unknown": "No effect of the library, alone or together with others, is in the answer set",
-    "inconclusive": "do not decide between the hypotheses of the answer set",
-    "tie": "Tied: dark offset or gain mismatch.",
-}
 
 
 def report_of(diagnosis: Diagnosis) -> dict[str, Any]:
@@ -104,7 +93,7 @@ def values(page: str) -> dict[str, str]:
     return dict(zip(names, texts(page, "dd"), strict=True))
 
 
-def test_the_page_needs_no_other_file_and_begins_with_the_summary() -> None:
+def test_the_page_needs_no_other_file_and_shows_the_numbers_of_the_report() -> None:
     check_stands_alone(html())
     report, said = report_of(found()), values(html())
     (lead,) = (t.text for t in read_page(html()) if t.attributes.get("class") == "lead")
@@ -122,10 +111,7 @@ def test_the_page_needs_no_other_file_and_begins_with_the_summary() -> None:
     assert float(said["noise"].split()[0]) == pytest.approx(gap["noise_pct"], rel=0.05)
     names = [name.split()[0] for name in pictures(html())]
     assert names == ["Map", "Residuals", "Bars", "Map", "Bars", "Observed"]
-
-
-def test_the_tables_list_effects_limits_psf_images_and_inputs() -> None:
-    report, rows = report_of(found()), rows_of(html())
+    rows = rows_of(html())
     tested = {row[0]: row for row in rows if len(row) == EFFECT_COLUMNS}
     for effect in report["effects"]:
         row = tested[effect["name"].replace("_", " ")]
@@ -135,23 +121,17 @@ def test_the_tables_list_effects_limits_psf_images_and_inputs() -> None:
         low, high = (round(100 * one) for one in effect["closure"]["ci90"])
         assert row[5] == f"{low + 0} to {high + 0}"
     assert ["saturation fill", "no pixel was filled in"] in rows
-    for name, limit in found().limits.effects.items():
-        one = limit.leading
-        shown = [f"{one.found_90:.3g}", f"{one.excluded_95:.3g}", one.unit]
-        assert [name.replace("_", " "), one.name, *shown] in rows
+    limit = found().limits.effects["dark_offset"].leading
+    shown = [f"{limit.found_90:.3g}", f"{limit.excluded_95:.3g}", limit.unit]
+    assert ["dark offset", limit.name, *shown] in rows
     # The PSF before and with the answer.
     before, after = (report["psf"][name]["total"] for name in ("refitted", "with_answer"))
     (total,) = (row for row in rows if row[0] == "total")
     assert total[1:3] == [with_error(one["value"], one["sigma"]) for one in (before, after)]
-    assert float(total[3]) == pytest.approx((after["value"] - before["value"]) / before["sigma"], abs=0.06)
-    for image in report["images"]:
-        (row,) = (row for row in rows if row[0] == image["file"] and len(row) > 8)
-        assert row[7] == with_error(image["residual_pct"], image["noise_pct"])
-        assert row[8] == with_error(image["residual_after_pct"], image["noise_after_pct"])
-    assert {"ab" * 32, "cd" * 32} <= {cell for row in rows for cell in row}
-    said = values(html())
-    assert said["libraries: numpy"] == "9.9" and said["seed"] == "5"
-    assert text_of(html()).rstrip().endswith("heliopsf 1.2.3")
+    image = report["images"][3]
+    (row,) = (row for row in rows if row[0] == image["file"] and len(row) > 8)
+    assert row[7] == with_error(image["residual_pct"], image["noise_pct"])
+    assert "ab" * 32 in {cell for row in rows for cell in row} and said["libraries: numpy"] == "9.9"
 
 
 @pytest.mark.parametrize("verdict", list(SHARES))
@@ -160,15 +140,11 @@ def test_every_verdict_is_explained_on_its_page(verdict: str, blank: None) -> No
     page = page_of(diagnosis)
     check_stands_alone(page)
     text, said, answered = text_of(page), values(page), verdict in ("attributed", "tie")
-    assert TOLD[verdict] in text and said["verdict"] == verdict
-    assert ("No effect was added to the model" in text) is not answered
+    assert said["verdict"] == verdict
     # Slices are shown only if an effect was added to the model, bars of closure only if there is a gap.
     assert any(name.startswith("Observed") for name in pictures(page)) is answered
     assert ("Bars of held-out closure by effect" in pictures(page)) is (verdict != "none")
-    assert ("To separate the tied effects, take a dark exposure" in text) is (verdict == "tie")
-    assert ("the best of the tied effects: dark offset" in text) is (verdict == "tie")
     unknown = UNKNOWN in diagnosis.judgement.members
-    assert ("the changes of unknown form that explain the gap best" in text) is unknown
     assert ("The most probable field of an unknown cause" in pictures(page)) is unknown
     assert any(row[:3] == [FIELD.words, "detector", "> 99 %"] for row in rows_of(page)) is unknown
     # The hypotheses, and for which data the coverage holds.
@@ -182,7 +158,7 @@ def test_every_verdict_is_explained_on_its_page(verdict: str, blank: None) -> No
     assert said[name] == (", ".join(diagnosis.judgement.answer).replace("_", " ") or "none")
 
 
-def test_a_field_without_a_map_or_a_curve_is_told_in_words_alone(blank: None) -> None:
+def test_what_has_no_picture_is_told_in_words(blank: None) -> None:
     diagnosis = judged("unknown")
     report = report_of(diagnosis)
     drawn = "The most probable field of an unknown cause"
@@ -192,40 +168,11 @@ def test_a_field_without_a_map_or_a_curve_is_told_in_words_alone(blank: None) ->
         field.pop("curve", None)
     page = gap_page(diagnosis, report)
     assert drawn not in pictures(page) and report["unknown"]["fields"][0]["form"] in text_of(page)
-
-
-def test_effects_that_the_data_cannot_tell_apart_are_listed(blank: None) -> None:
     assert "No two effects are closer than 3 sigma" in text_of(html())
     pair = Alike(OFFSET_BLUR, 1.4, "a series of exposure times")
     page = page_of(replace(found(), limits=replace(found().limits, alike=(pair,))))
     assert ["dark offset and core blur", "1.40", "a series of exposure times"] in rows_of(page)
     assert "No two effects are closer" not in text_of(page)
-
-
-def test_the_bars_mark_the_named_and_the_tied_effects(blank: None) -> None:
-    """Of two pairs both, of an effect and a pair with it both; effects of a pair come before single effects."""
-    pairs, rest = {OFFSET_BLUR: 0.5, OFFSET_GAIN: 0.45}, {UNKNOWN: 0.03, (): 0.02}
-    with_a_pair, pair = {OFFSET_BLUR: 0.55, OFFSET: 0.4}, {OFFSET_BLUR: 0.95}
-    for shares in (pairs, with_a_pair, pair):
-        chosen = list(shares)
-        report = report_of(with_shares(shares | rest))
-        axes = Figure().subplots()
-        draw_effects(axes, report)
-        mark = "  (tied)" if report["verdict"] == "tie" else "  (named)"
-        labels = [label.get_text() for label in axes.get_yticklabels()]
-        words = [" + ".join(one).replace("_", " ") for one in chosen]
-        assert [label.removesuffix(mark) for label in labels if label.endswith(mark)] == words
-        assert sum("(" in label for label in labels) == len(chosen), chosen
-    tie = page_of(with_shares(pairs | rest))
-    assert "dark offset, together with core blur or gain mismatch." in text_of(tie)
-    effects = [row[0] for row in rows_of(page_of(with_shares(pair | rest))) if len(row) == EFFECT_COLUMNS]
-    at = [effects.index(name) for name in ("dark offset + core blur", "dark offset", "gain mismatch")]
-    assert at == sorted(at)
-
-
-def test_one_picture_has_all_figures_and_without_held_out_images_the_page_shows_no_residuals(
-    blank: None,
-) -> None:
     few = replace(judged("none"), residual=None, unknown=())
     page = page_of(few)
     check_stands_alone(page)
@@ -246,7 +193,7 @@ def test_a_malicious_file_name_is_shown_as_text(blank: None) -> None:
     assert texts(page, "td").count(name) == 1
 
 
-def test_the_map_shows_every_disc_at_its_place() -> None:
+def test_the_map_shows_every_disc_at_its_place_and_bars_show_closure() -> None:
     report, figure = report_of(found()), Figure()
     draw_map(figure, report)
     charts = figure.axes[:2]
@@ -259,9 +206,6 @@ def test_the_map_shows_every_disc_at_its_place() -> None:
         discs = {(round(i["x_px"], 3), round(i["y_px"], 3)): i[column] for i in report["images"]}
         assert drawn == pytest.approx(discs)
     assert charts[0].collections[0].get_clim() == charts[1].collections[0].get_clim()
-
-
-def test_bars_show_closure_and_mark_values_outside_the_chart() -> None:
     report = report_of(found())
     report["effects"][1]["closure"] = {"value": -4.0, "ci90": [-9.0, 0.5]}
     axes = Figure().subplots()
@@ -274,7 +218,7 @@ def test_bars_show_closure_and_mark_values_outside_the_chart() -> None:
     assert axes.get_yticklabels()[0].get_text() == "dark offset  (named)"
 
 
-def test_cells_show_means_of_all_discs_and_noise_has_no_strong_colour() -> None:
+def test_cells_show_means_of_all_discs() -> None:
     discs = found().evidence.discs
     means, errors = cell_means(discs)
     middle = [
@@ -283,16 +227,6 @@ def test_cells_show_means_of_all_discs_and_noise_has_no_strong_colour() -> None:
     assert means[0] == pytest.approx(np.mean(middle))
     assert 0 < errors[0] < np.nanmax(errors)
     assert np.isfinite(means).sum() >= 9
-    quiet = [
-        replace(d, residual=0.3 * np.sqrt(np.diag(d.covariance)) / np.sqrt(len(discs)) * (-1) ** k)
-        for k, d in enumerate(discs)
-    ]
-    evidence = replace(found().evidence, discs=tuple(quiet))
-    figure = Figure()
-    draw_cells(figure, replace(judged("none"), model=replace(found().model, evidence=evidence)))
-    (axes,) = figure.axes
-    colours = np.array([patch.get_facecolor()[:3] for patch in axes.patches[:-1]])
-    assert colours.min() > 0.75  # near white
 
 
 def test_a_simulated_image_with_the_answer_contains_the_effect() -> None:

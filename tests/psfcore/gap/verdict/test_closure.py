@@ -69,7 +69,7 @@ def of_images(chi2: float, expected: float, blocks: float = 0.0, residual_pct: f
     )
 
 
-def test_closure_gap_and_fall_by_hand() -> None:
+def test_closure_its_interval_gap_and_fall_by_hand() -> None:
     rng = np.random.default_rng(1)
     before, after = of_images(110.0, 10.0, residual_pct=5.0), of_images(20.0, 10.0, residual_pct=1.0)
     found = closure(before, after, rng)
@@ -81,8 +81,6 @@ def test_closure_gap_and_fall_by_hand() -> None:
     first = replace(before, deviance={(0,): 30.0, (1,): 20.0})
     assert fall(first, replace(after, deviance={(0,): 12.0, (2,): 1.0})) == 18.0
 
-
-def test_the_interval_of_closure_contains_its_known_errors() -> None:
     def found(after: HeldOut, scale_error: float = 0.0, blocks: float = 0.0) -> tuple[float, float, float]:
         interval = closure(of_images(110.0, 10.0, blocks), after, np.random.default_rng(1), scale_error)
         assert interval is not None

@@ -18,7 +18,7 @@ from psfcore.gap.evidence.evidence import Evidence, gather
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
 from psfcore.gap.evidence.search import displaced
 from psfcore.gap.verdict import correction
-from psfcore.gap.verdict.correction import Corrected, add_to_model, images_without
+from psfcore.gap.verdict.correction import add_to_model, images_without
 from psfcore.gap.verdict.posterior import with_same_data
 from psfcore.gap.view import View
 from psfcore.scatter.reconstruction import Solution
@@ -93,25 +93,6 @@ def test_a_refit_of_several_rounds_computes_the_jacobian_once(monkeypatch: pytes
     for made, again in zip(added.evidence.discs, alone.discs, strict=True):
         assert made.residual == pytest.approx(again.residual)
         assert made.jacobian == pytest.approx(again.jacobian)
-
-
-def test_a_refit_gives_the_parameters_of_each_effect() -> None:
-    """The names of the parameters, without the name of the effect that precedes them if several effects are fitted together."""
-
-    def refit(names: Sequence[str], values: dict[str, tuple[float, float, str]]) -> Corrected:
-        kept: Any = None  # not read
-        return Corrected(tuple(effect(name) for name in names), kept, kept, kept, values, {}, 1)
-
-    alone = refit(["ghost"], {"share": (0.1, 0.01, "")})
-    assert alone.parameters("ghost") == {"share": (0.1, 0.01)} and alone.label == "ghost"
-    both = refit(
-        ["ghost", "column_smear"],
-        {"ghost.share": (0.1, 0.01, ""), "column_smear.share_below": (0.2, 0.02, "")},
-    )
-    assert both.parameters("ghost") == {"share": (0.1, 0.01)}
-    assert both.parameters("column_smear") == {"share_below": (0.2, 0.02)}
-    assert both.parameters("dark_offset") == {}
-    assert both.label == "ghost + column_smear"
 
 
 def test_a_share_of_light_cannot_be_negative() -> None:

@@ -108,9 +108,7 @@ def test_the_excluded_strength_is_a_quantile_of_the_fitted_one(model: LinearMode
         assert excluded == pytest.approx(value + norm.ppf(0.95) * sigma, abs=0.6 * sigma), name
 
 
-def test_the_found_strength_of_one_parameter_is_that_of_a_noncentral_chi2(
-    model: LinearModel, limits_of: Of
-) -> None:
+def test_the_found_strength_is_that_of_a_noncentral_chi2(model: LinearModel, limits_of: Of) -> None:
     """With one effect in the library, and against "no effect" alone, the strength follows from one noncentral chi2 variable."""
     (column,), base = model.evidence.columns["dark_offset"], list(model.evidence.base)
     offset = effect_of(model.evidence, "dark_offset")
@@ -129,9 +127,6 @@ def test_the_found_strength_of_one_parameter_is_that_of_a_noncentral_chi2(
 
     least = next(z2 for z2 in np.arange(0.0, 60.0, 0.01) if log_odds(z2) > math.log(1 / THRESHOLD - 1))
     assert float(ncx2.sf(least, 1, information * strength**2)) == pytest.approx(0.9, abs=0.02)
-
-
-def test_a_stricter_answer_needs_a_stronger_effect(model: LinearModel, limits_of: Of) -> None:
     usual, strict, lax, warm = (
         strength_of(limits_of(model, **changes), "dark_offset")
         for changes in ({}, {"threshold": 0.01}, {"threshold": 0.2}, {"temperature": 3.0})
@@ -139,7 +134,7 @@ def test_a_stricter_answer_needs_a_stronger_effect(model: LinearModel, limits_of
     assert strict > usual > lax and warm > usual
 
 
-def test_the_quantile_of_a_sum_of_noncentral_variables() -> None:
+def test_the_quantiles_of_a_sum_of_noncentral_variables_and_of_a_strength() -> None:
     for weights, d2 in (([1.0], [20.0]), ([0.9, 0.5, 0.1], [8.0, 3.0, 0.0]), ([1.0, 1.0], [0.0, 0.0])):
         w, d = np.array(weights), np.array(d2)
         of_sum = np.array([[np.sum(w**r * (1 + r * d)) for r in (1, 2, 3)]])
@@ -158,9 +153,6 @@ def test_the_quantile_of_a_sum_of_noncentral_variables() -> None:
     third = float(np.mean((sums - sums.mean()) ** 3))
     found = cumulants(values, score, random=True) @ strength ** (2 * np.arange(4))
     assert found == pytest.approx([sums.mean(), sums.var() / 2, third / 8], rel=0.05)
-
-
-def test_the_quantile_of_a_strength() -> None:
     assert upper_limit(0.0, 2.0, False) == pytest.approx(2 * norm.ppf(0.975))
     assert upper_limit(0.0, 2.0, True) == pytest.approx(2 * norm.ppf(0.975))
     assert upper_limit(-30.0, 1.0, False) == pytest.approx(30 + norm.ppf(0.95))
@@ -184,7 +176,7 @@ def test_two_effects_with_one_form_are_alike_and_others_are_not(model: LinearMod
     assert apart.distances["dark_offset", "column_smear"] > ALIKE and not apart.alike
 
 
-def test_the_limits_as_json(model: LinearModel, limits_of: Of) -> None:
+def test_the_limits_as_json_and_their_leading_parameter(model: LinearModel, limits_of: Of) -> None:
     evidence = replace(model.evidence, untestable={"ghost": "the mirror is missing"})
     found = limits_of(replace(model, evidence=evidence)).as_json()
     offset = found["limits"]["dark_offset"]
@@ -201,8 +193,6 @@ def test_the_limits_as_json(model: LinearModel, limits_of: Of) -> None:
     assert set(of_any_size.effects) == {"column_smear"}
     assert "is infinite" in of_any_size.untestable["dark_offset"]
 
-
-def test_the_leading_parameter_is_the_first_that_would_be_found_at_its_likely_size() -> None:
     def leading(**strengths: float | None) -> ParameterLimits:
         parameters = (ParameterLimits(name, "", 2.0, found, None) for name, found in strengths.items())
         return EffectLimits(tuple(parameters)).leading

@@ -116,6 +116,11 @@ def test_which_hypotheses_are_refitted_and_what_remains() -> None:
         assert next(iter(without_idle(found.probabilities()))) == best, logs
         assert evidence != {A: {}} or refit.bounds == [3 * VISIBLE]
         assert ABC not in logs or ABC in found.log_weights
+    # Many effects of equal probability, and no refit changes anything.
+    names = [(f"effect_{k}",) for k in range(3 * MOST_REFITS)]
+    refit = Refitted({one: {one: 30.0} for one in names})
+    settled({NONE: 0.0} | dict.fromkeys(names, 30.0), refit)
+    assert len(refit.asked) == len(set(refit.asked)) == MOST_REFITS
 
 
 def test_triples_follow_the_refits_of_their_effects() -> None:
@@ -128,11 +133,3 @@ def test_triples_follow_the_refits_of_their_effects() -> None:
     found, gone = settled(PAIR | {AB: 45.0, ABC: 44.0}, refit)
     assert refit.asked[:2] == [A, AB] and gone == {AB, ABC}
     assert next(iter(found.probabilities())) == A
-
-
-def test_the_number_of_refits_is_bounded() -> None:
-    """Many effects of equal probability, and no refit changes anything."""
-    names = [(f"effect_{k}",) for k in range(3 * MOST_REFITS)]
-    refit = Refitted({one: {one: 30.0} for one in names})
-    settled({NONE: 0.0} | dict.fromkeys(names, 30.0), refit)
-    assert len(refit.asked) == len(set(refit.asked)) == MOST_REFITS

@@ -41,7 +41,7 @@ def in_bands() -> Bands:
     return bands(shared(), solved().inversion.radii_px)
 
 
-def test_a_sample_excludes_its_block_and_guard_and_keeps_the_sizes_of_blocks() -> None:
+def test_a_sample_excludes_its_block_and_guard_and_an_empty_one_is_refused() -> None:
     parts = folds(IMAGES)
     for draw in bootstrap_samples(IMAGES, runs=3):
         fitted = set(parts[draw.fold].fitted)
@@ -49,6 +49,14 @@ def test_a_sample_excludes_its_block_and_guard_and_keeps_the_sizes_of_blocks() -
         assert {n for n, k in enumerate(draw.counts) if k} <= fitted and sum(draw.counts) == len(fitted)
     with pytest.raises(DataError, match="too-few-images"):
         bootstrap_samples(5)
+    everything = dataclasses.replace(bootstrap_samples(IMAGES, runs=1)[0], counts=(1,) * IMAGES)
+    moved = np.abs(shared_step(solved(), everything))
+    assert (moved < 0.05 * np.sqrt(np.diag(solved().inversion.covariance))).all()
+    nothing = dataclasses.replace(bootstrap_samples(IMAGES, runs=1)[0], counts=(0,) * IMAGES)
+    with pytest.raises(DataError, match=r"transit-says-too-little.*run 0, fold 0"):
+        shared_fits(solved(), (nothing,))
+    with pytest.raises(DataError, match="transit-says-too-little"):
+        exact_fit(solved(), nothing)
 
 
 def test_an_exact_fold_agrees_with_a_fit_from_the_start() -> None:
@@ -93,20 +101,6 @@ def test_a_fold_reports_progress_before_every_image(monkeypatch: pytest.MonkeyPa
     assert stages["settling"] == stages["free shells"] != []
 
 
-def test_a_progress_callback_can_stop_a_fold() -> None:
-    class Stop(Exception):
-        pass
-
-    for last in ("images held out", "settling"):
-
-        def progress(stage: str, _step: int, _steps: int, last: str = last) -> None:
-            if stage == last:
-                raise Stop
-
-        with pytest.raises(Stop):
-            exact_fit(solved(), bootstrap_samples(IMAGES, runs=1)[1], progress=progress)
-
-
 def test_both_schemes_agree() -> None:
     wanted = bootstrap_samples(IMAGES, runs=1)
     quick = shared_fits(solved(), wanted)
@@ -120,20 +114,6 @@ def test_both_schemes_agree() -> None:
     assert one.near_centre.points == pytest.approx(
         other.near_centre.points, abs=0.5 * other.near_centre.sigma
     )
-
-
-def test_with_all_images_once_the_step_is_zero() -> None:
-    everything = dataclasses.replace(bootstrap_samples(IMAGES, runs=1)[0], counts=(1,) * IMAGES)
-    moved = np.abs(shared_step(solved(), everything))
-    assert (moved < 0.05 * np.sqrt(np.diag(solved().inversion.covariance))).all()
-
-
-def test_an_empty_sample_is_refused() -> None:
-    nothing = dataclasses.replace(bootstrap_samples(IMAGES, runs=1)[0], counts=(0,) * IMAGES)
-    with pytest.raises(DataError, match=r"transit-says-too-little.*run 0, fold 0"):
-        shared_fits(solved(), (nothing,))
-    with pytest.raises(DataError, match="transit-says-too-little"):
-        exact_fit(solved(), nothing)
 
 
 def test_folds_go_to_json_and_back() -> None:

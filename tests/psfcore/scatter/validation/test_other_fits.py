@@ -51,7 +51,7 @@ def by_name(compared: tuple[ComparedShape, ...]) -> dict[str, ComparedShape]:
     return {shape.name: shape for shape in compared}
 
 
-def test_a_simulated_stretch_is_found() -> None:
+def test_a_simulated_stretch_is_found_and_gains_most() -> None:
     """To first order, near the best fit without a stretch."""
     log, turn = math.log(1.15), math.radians(2 * -15.0)
     found = compared_stretched()["stretched"].added
@@ -59,9 +59,6 @@ def test_a_simulated_stretch_is_found() -> None:
         value, sigma = found[name]
         assert abs(value - true) < 3 * sigma
         assert abs(value) > 8 * sigma
-
-
-def test_the_simulated_shape_gains_most() -> None:
     compared = compared_stretched()
     by_gain = sorted(compared, key=lambda name: -compared[name].gain)
     held_out = {name: shape.held_out_gain or 0.0 for name, shape in compared.items()}
@@ -153,7 +150,7 @@ def test_slopes_are_those_of_the_inversion() -> None:
             assert abs(shares().score[k, shell] - float(weight @ (slope * residual))) < 0.1 * np.sqrt(normal)
 
 
-def test_images_add_up() -> None:
+def test_images_add_up_and_no_shell_is_negative_or_unconstrained() -> None:
     """An image that occurs twice in a bootstrap sample counts as two; a missing image does not count."""
     of = shares()
     twice = [0, 2, *([1] * (len(once()) - 2))]
@@ -169,9 +166,6 @@ def test_images_add_up() -> None:
     np.testing.assert_allclose(found.light, expected.light, atol=1e-9)
     np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-6, atol=1e-12)
     assert np.abs(found.light - of.fit(once(), of.law_light).light).max() > 1e-4
-
-
-def test_no_shell_is_negative_and_unconstrained_shells_follow_the_formula() -> None:
     beyond = np.array(shells().edges_px[:-1]) > 200.0  # no two pixels of a 128 px field are that far apart
     for law in (shares().law_light, 1.1 * shares().law_light):
         found = shares().fit(once(), law)
@@ -215,9 +209,6 @@ def test_a_free_kernel_with_the_light_of_the_formula_is_the_formulas_kernel() ->
     assert scatter.sum() == pytest.approx(1.0, abs=1e-6) and changed.min() > -1e-6
     light = shells().mean_of_map(scatter) * shells().counts
     np.testing.assert_allclose(light, free.light, atol=1e-6)
-
-
-def test_light_of_the_formula_is_all_that_is_scattered() -> None:
     at = SOFTENED_POWER_LAW.coordinates({"total": 0.4})
     assert law_light(SOFTENED_POWER_LAW, at).sum() == pytest.approx(0.4, rel=1e-9)
     assert TotalPsf(np.ones((1, 1)), SHAPES["knee"], (64, 64)).shape.isotropic
@@ -250,10 +241,6 @@ def test_a_positive_offset_is_fitted_as_more_scatter() -> None:
     changes = [np.abs(o.weight_change_pct).max() for o in study.offsets]
     assert study.largest("weight_change_pct") == max(changes) > 2
     assert 0.5 < study.largest("curve_change_points") < 4
-
-
-def test_weights_change_as_the_fitted_formulas_do() -> None:
-    study = offsets()
     nominal, other = ({**v} for v in (study.nominal, study.offsets[1].values))
     kernels = [SOFTENED_POWER_LAW.kernel(SOFTENED_POWER_LAW.coordinates(v), 512) for v in (other, nominal)]
     at = np.flatnonzero(study.radii_px == 20)[0]
