@@ -12,6 +12,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ from psfcore.fits.header import read_summary
 from psfcore.fits.images import write_image
 from psfcore.fits.observation import read_observation
 from psfcore.fits.psfs import read_psf
+from psfcore.fits.viewing.regions import Region, write_cutout
 from psfcore.instruments.model import parse_instrument
 from psfcore.instruments.workload import check_workload
 from psfcore.scatter import power_law
@@ -62,6 +64,9 @@ def read_an_image(content: bytes, folder: Path) -> str:
     assert read_observation(product, LIMITS).pixels.shape == summary.shape
     if summary.psf_name is not None:
         read_psf(path, LIMITS)
+    # Cards of places reach a library in C. What it cannot use is an error of the user.
+    with (folder / "cut.fits").open("wb") as cut, suppress(DataError):
+        write_cutout(product, Region.circle("helioprojective", 0.0, 0.0, 2.0), LIMITS, cut)
     return "result"
 
 

@@ -25,6 +25,7 @@ TEXTS = (
     *("T", "F", "''", "'x'", "nan", "inf", "1E400", "-1.5", "1E-300", "(1,2)", "&", "", "'RICE_1'", "'GZIP_1'", "'GZIP_2'"),
     *("'NOCOMPRESS'", "'HCOMPRESS_1'", "'PLIO_1'", "'RICE_ONE'", "'1PB(9)'", "'1PI'", "'1QB'", "'1PD'", "'999999999J'"),
     *("'PX'", "'1D'", "'SUBTRACTIVE_DITHER_1'", "'SUBTRACTIVE_DITHER_2'", "'NO_DITHER'", "'BYTEPIX'", "'BLOCKSIZE'"),
+    *("'HPLN-SIP'", "'RA---TPV'", "'HPLT-CAR'", "'STOKES'", "'FREQ-LOG'", "'WAVE-TAB'", "'furlong'", "'10**400 m'"),
     *("'$\\frac{$'", "'a$b$c'", "'BINTABLE'", "'IMAGE'", "'TABLE'", "'2020-01-01T00:00:00'", "'not closed", "3 2 x"),
 )  # fmt: skip
 ADDED = (
@@ -32,6 +33,7 @@ ADDED = (
     *("BZERO", "THEAP", "TSCAL1", "TZERO1", "TDIM1", "TNULL1", "TFORM2", "TTYPE2", "ZTILE1", "ZTILE2", "ZTILE3", "ZNAXIS3"),
     *("ZMASKCMP", "GROUPS", "PCOUNT", "GCOUNT", "EXTNAME", "EXTVER", "TFIELDS", "NAXIS3", "CHECKSUM", "DATASUM", "INHERIT"),
     *("PSFNAME", "PSFVERS", "INSTRUME", "DETECTOR", "DATE-OBS", "DATE-BEG", "BUNIT", "SATURATE", "CDELT1", "CUNIT1"),
+    *("WCSAXES", "CTYPE1", "CTYPE9", "CRPIX1", "CRVAL2", "CROTA2", "PC1_2", "CD1_900", "PV2_999", "LONPOLE", "A_ORDER", "CUNIT2"),
     *("HISTORY", "COMMENT", "CONTINUE", "HIERARCH", "END", "", "DP1", "LONGSTRN", "GAINCOMB", "XPOSURE", "PXBEG1"),
 )  # fmt: skip
 
@@ -136,6 +138,9 @@ def _plain_bases() -> tuple[bytes, ...]:
     bases = []
     header = fits.Header({"TELESCOP": "SOLO", "INSTRUME": "EUI", "DETECTOR": "HRI_EUV", "WAVELNTH": 174})
     header.update({"DATE-BEG": "2022-03-17T00:00:00", "XPOSURE": 2.0, "CDELT1": 0.492, "CUNIT1": "arcsec"})
+    header.update(
+        {"CTYPE1": "HPLN-TAN", "CTYPE2": "HPLT-TAN", "CDELT2": 0.492, "CUNIT2": "arcsec", "CRPIX1": 33}
+    )
     header.update({"GAINCOMB": "combined", "PXBEG1": 1, "PXEND1": 66, "LONG": "x" * 100, "BUNIT": "DN/s"})
     header["HIERARCH a long key"] = 3.5
     header.add_history("made")

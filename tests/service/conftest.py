@@ -116,6 +116,18 @@ def run_jobs(settings: Settings, api: TestClient) -> Callable[[], None]:
     return run
 
 
+@pytest.fixture
+def psf_id(api: TestClient, psf_file: Path) -> str:
+    """The id of an uploaded PSF."""
+    return upload(api, psf_file, "/v1/psfs")
+
+
+@pytest.fixture
+def work(settings: Settings, api: TestClient) -> Callable[[], None]:
+    """Run turns until no bulk run has work."""
+    return lambda: work_through_bulks(settings)
+
+
 def work_through_bulks(settings: Settings) -> None:
     """Run turns until no bulk run has work."""
     catalogue = Catalogue(settings.catalogue_url)

@@ -1,25 +1,20 @@
-"""What a new user does with a real service: the curl lines of the documentation, Control-C, and commands over HTTP."""
+"""What a new user does with a real service: the curl lines of the documentation, Control-C, and commands over HTTP.
+Real images over HTTP."""
 
 from __future__ import annotations
 
 import json
-import os
-import pty
 import re
 import shutil
-import signal
 import subprocess
 import sys
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
 from astropy.io import fits
 
 from tests.conftest import REPOSITORY, write_image, write_psf
-from tests.whole.stack import Stack, wait_for
-
-COMMAND = (sys.executable, "-m", "service.cli")
+from tests.whole.stack import Stack
 
 
 def test_the_service_says_what_to_open_in_a_browser(open_stack: Stack) -> None:
@@ -51,47 +46,6 @@ def test_the_curl_lines_of_the_documentation_work(open_stack: Stack, tmp_path: P
     assert "event: end" in (tmp_path / "events.txt").read_text()
 
 
-def test_control_c_leaves_the_job_and_the_commands_that_it_names_work(
-    open_stack: Stack, tmp_path: Path
-) -> None:
-    write_image(tmp_path / "large.fits", shape=(2048, 2048), OBSERVER=tmp_path.name)
-    write_psf(tmp_path / "psf.fits")
-    image = open_stack.client.upload_image(tmp_path / "large.fits")["id"]
-    psf = open_stack.client.upload_psf(tmp_path / "psf.fits")["id"]
-    method = {"name": "richardson-lucy", "steps": 200}
-    job: str = open_stack.client.submit("deconvolve", image_id=image, psf_id=psf, method=method)["id"]
-    wait_for(lambda: open_stack.client.job(job)["progress"]["step"] > 1, "the job is at work")
-    address = open_stack.client.server.removeprefix("http://")
-    terminal, other_end = pty.openpty()
-    waiting = subprocess.Popen(
-        [*COMMAND, "job", "wait", job[:12], "--server", address],
-        stderr=other_end,
-        stdout=subprocess.DEVNULL,
-        # A shell starts commands in the background with SIGINT ignored, and the tests may run there.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
-    os.close(other_end)
-    shown = b""
-    while b"deconvolving" not in shown:  # the bar: the command has begun to wait
-        shown += os.read(terminal, 1000)
-    waiting.send_signal(signal.SIGINT)
-    rest = b""
-    with suppress(OSError):  # Linux's way to tell the end of a terminal
-        while True:
-            rest += os.read(terminal, 1000)
-    os.close(terminal)
-    told = rest.decode().replace("\r\n", "\n")
-    assert waiting.wait(60) == 130, told
-    assert f"interrupted; job {job[:12]} goes on" in told and "Traceback" not in told
-    assert open_stack.client.job(job)["phase"] == "EXECUTING"
-    cancel = re.findall(r"cancel it: +heliopsf (.+)", told)[0].split()
-    assert cancel == ["job", "cancel", job[:12], "--server", open_stack.client.server]
-    assert subprocess.run([*COMMAND, *cancel], timeout=60, check=False).returncode == 0
-    rejoin = re.findall(r"again: +heliopsf (.+)", told)[0].split()
-    ended = subprocess.run([*COMMAND, *rejoin], capture_output=True, text=True, timeout=60, check=False)
-    assert ended.returncode == 1 and f"job {job[:12]}: ABORTED" in ended.stderr
-
-
 @pytest.mark.slow
 def test_the_command_line_over_http_and_local_agree(
     open_stack: Stack, tmp_path: Path, psf_file: Path
@@ -103,3 +57,41 @@ def test_the_command_line_over_http_and_local_agree(
         output = ["--psf", str(psf_file), "-o", str(tmp_path / f"{name}.fits")]
         subprocess.run([*command, *output, *way], check=True)
     assert (tmp_path / "remote.fits").read_bytes() == (tmp_path / "local.fits").read_bytes()
+
+
+# --- real images -----------------------------------------------------------------------------------------
+
+
+HRI = "data/real/eui/derived_hrieuv174_20220401T103005920_pseudolinear.fits"
+AIA = "data/real/aia/aia.lev1_euv_12s.2022-04-02T132423Z.304.image.fits"
+AIA_GZ = "data/real/aia/AIA20110319_105400_0171.fits.gz"  # binned 4 x 4
+TRACE = "data/real/other/trace_19980519_222143_171.fits.gz"
+
+
+@pytest.mark.slow
+def test_the_real_hri_image(open_stack: Stack, shared: Path, tmp_path: Path) -> None:
+    output = tmp_path / "out.fits"
+    product = open_stack.client.deconvolve(shared / HRI, output)
+    change = product["details"]
+    assert abs(change["flux_change_pct"]) < 1
+    assert change["bright_change_pct"] > 10
+    assert change["dark_change_pct"] < -5
+    sunpy_map = pytest.importorskip("sunpy.map").Map(output)[0]
+    assert sunpy_map.detector == "HRI_EUV" and sunpy_map.data.shape == (2048, 2048)
+    before = fits.getheader(shared / HRI, 1)
+    for card in ("CRVAL1", "CRPIX2", "PC1_2", "CDELT1", "RSUN_ARC", "DATE-BEG", "XPOSURE"):
+        assert sunpy_map.fits_header[card] == before[card]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "psf"), [(AIA, "aia_304"), (AIA_GZ, "aia_171"), (TRACE, "trace_171")])
+def test_real_images_need_no_option(
+    open_stack: Stack, shared: Path, tmp_path: Path, name: str, psf: str
+) -> None:
+    product = open_stack.client.deconvolve(shared / name, tmp_path / "out.fits")
+    assert abs(product["details"]["flux_change_pct"]) < 1
+    dark = product["details"]["dark_change_pct"]
+    # The darkest pixels of the binned image sum to less than zero, so that their change has no percentage.
+    assert dark is None if name == AIA_GZ else dark < 0
+    assert product["details"]["bright_change_pct"] > 0
+    assert fits.getheader(tmp_path / "out.fits")["PSFNAME"] == psf

@@ -19,12 +19,11 @@ from sqlalchemy.exc import OperationalError
 
 from service.api import events
 from service.api.events import Watch
-from service.app import create_app
 from service.client.http import ServiceError
 from service.views import JobView
-from tests.service.api.live import Following, Live, running
 from tests.service.conftest import execute, refusal
 from tests.service.keyed import bearer, keyed
+from tests.service.serving import Following, Live, running
 from tests.whole.stack import wait_for
 from workers.catalogue import followed
 from workers.catalogue.bulks import new_id
@@ -95,10 +94,11 @@ def test_an_idle_stream_sends_comments_and_a_closed_connection_frees_its_stream(
         lines = answer.iter_lines()  # let go of, it would close the connection
         next(lines)
         assert live.streams() == 2
-        with httpx.stream("GET", f"{live.url}/v1/jobs/{job_id}/events") as answer:
-            assert answer.status_code == 429  # the body of an accepted stream would never end
-            answer.read()
-            refusal(answer, 429, "too-many-streams")
+        for address in ("/v1/events", f"/v1/jobs/{job_id}/events"):
+            with httpx.stream("GET", f"{live.url}{address}") as answer:
+                assert answer.status_code == 429  # the body of an accepted stream would never end
+                answer.read()
+                refusal(answer, 429, "too-many-streams")
     wait_for(lambda: live.streams() == 1, "the place is free", timeout_s=10)
     live.catalogue.jobs.complete(lease, "r" * 64)
     following.join(10)
@@ -118,32 +118,6 @@ def test_a_job_that_is_destroyed_and_a_server_that_stops_end_their_streams(live:
     live.app.state.stopping = True
     both[1].join(10)
     assert not both[1].is_alive() and both[1].said("event:") == ["progress"]
-
-
-def test_a_bulk_is_followed(live: Live) -> None:
-    bulk_id = bulk_run(live.catalogue)
-    following = Following(f"{live.url}/v1/bulk/{bulk_id}/events")
-    following.await_lines("data:", 1)
-    assert '"total":2' in following.said("data:")[0]
-    live.client.pause_bulk(bulk_id)
-    following.await_lines("data:", 2)
-    assert live.client.wait_for_bulk(bulk_id)["phase"] == "PAUSED", "nobody waits for what does not go on"
-    live.client.cancel_bulk(bulk_id)
-    following.join(10)
-    assert following.said("event:") == ["progress", "progress", "end"]
-
-
-def test_a_stream_ends_after_its_time_and_can_be_continued(
-    settings: Settings, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(events, "LOOK_EVERY_S", 0.02)
-    with TestClient(create_app(settings.model_copy(update={"stream_s": 0.2}))) as api:
-        catalogue = api.app.state.heliopsf.catalogue
-        job, _ = catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)
-        said = api.get(f"/v1/jobs/{job.id}/events").text
-        assert said.count("event: progress") == 1 and "event: end" not in said
-        known = said.split("id: ")[1].split()[0]
-        assert "event:" not in api.get(f"/v1/jobs/{job.id}/events", headers={"Last-Event-ID": known}).text
 
 
 def test_a_stream_ends_with_its_key(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -197,12 +171,10 @@ class Looks:
 
     watch: Watch[Any]
 
-    def __init__(
-        self, catalogue: Catalogue, *named: str, owner: str = DEFAULT_OWNER, since: float | None = None
-    ) -> None:
-        since = catalogue.followed_jobs.now() - events.OVERLAP_S if since is None else since
+    def __init__(self, catalogue: Catalogue, *named: str, since: float | None = None) -> None:
         rows = catalogue.followed_jobs
-        self.watch = Watch("job", rows, JobView.of, owner, frozenset(named), Place(since))
+        since = rows.now() - events.OVERLAP_S if since is None else since
+        self.watch = Watch("job", rows, JobView.of, DEFAULT_OWNER, frozenset(named), Place(since))
 
     def told(self) -> list[tuple[str, dict[str, Any]]]:
         news, self.watch = self.watch.look()
@@ -215,10 +187,10 @@ class Looks:
 class BulkLooks(Looks):
     """The same for bulk runs."""
 
-    def __init__(self, catalogue: Catalogue, *named: str, after_end: int = 2) -> None:
-        since = Place(catalogue.followed_bulks.now() - events.OVERLAP_S)
+    def __init__(self, catalogue: Catalogue, *named: str) -> None:
         rows = catalogue.followed_bulks
-        self.watch = Watch("bulk", rows, Line.of, DEFAULT_OWNER, frozenset(named), since, after_end=after_end)
+        since = Place(rows.now() - events.OVERLAP_S)
+        self.watch = Watch("bulk", rows, Line.of, DEFAULT_OWNER, frozenset(named), since, after_end=2)
 
 
 def _parsed(text: str) -> tuple[str, dict[str, Any]]:
@@ -289,18 +261,6 @@ def test_ends_that_no_look_saw_coming_are_told_once(catalogue: Catalogue) -> Non
     assert looks.told() == [("gone", {"kind": "job", "id": deleted})] and looks.told() == []
 
 
-@pytest.mark.parametrize("end", ["pause", "cancel"])
-def test_a_deleted_bulk_run_is_gone_once(catalogue: Catalogue, end: str) -> None:
-    run, kept = bulk_run(catalogue), bulk_run(catalogue)
-    looks = BulkLooks(catalogue)
-    looks.told()
-    for one in (run, kept):
-        assert getattr(catalogue.bulks, end)(one)
-    assert {phase for _, phase in looks.phases()} == {"PAUSED" if end == "pause" else "CANCELLED"}
-    assert catalogue.bulks.delete(run)
-    assert looks.told() == [("gone", {"kind": "bulk", "id": run})] and looks.told() == []
-
-
 def test_a_bulk_run_that_ended_some_time_ago_is_followed_until_it_is_deleted(
     catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -322,18 +282,6 @@ def test_a_bulk_run_that_ended_some_time_ago_is_followed_until_it_is_deleted(
     assert sorted(looks.phases()) == sorted((run, "gone") for run in runs[1:])
     assert looks.told() == []
     assert BulkLooks(catalogue, before).phases() == [(before, "gone")], "as a name that nothing has"
-
-
-def test_a_named_job_is_told_in_any_phase_and_when_it_is_deleted(catalogue: Catalogue) -> None:
-    draft = catalogue.uws.draft("psf-build", {}, owner=DEFAULT_OWNER).id
-    old, unknown = submitted(catalogue), "0" * 32
-    ended_long_ago(catalogue, old)
-    assert Looks(catalogue).told() == [], "without its name, an old end is no news"
-    looks = Looks(catalogue, draft, old, unknown)
-    assert sorted(looks.phases()) == sorted([(draft, "PENDING"), (old, "COMPLETED"), (unknown, "gone")])
-    assert looks.told() == []
-    catalogue.uws.destroy(old)
-    assert looks.phases() == [(old, "gone")] and looks.told() == []
 
 
 def test_other_owners_and_turns_of_bulk_runs_are_not_told(catalogue: Catalogue) -> None:
@@ -419,14 +367,20 @@ def test_a_stream_follows_jobs_and_bulk_runs(live: Live) -> None:
     first_id, lease = live.job()
     following = Following(f"{live.url}/v1/events")
     following.await_lines("data:", 1)  # the job that is at work
-    assert following.type.startswith("text/event-stream") and live.streams() == 1
+    assert live.streams() == 1
     bulk_id = bulk_run(live.catalogue)
     following.await_lines("data:", 2)
     live.client.pause_bulk(bulk_id)
     following.await_lines("data:", 3)  # its pause
+    assert live.client.wait_for_bulk(bulk_id)["phase"] == "PAUSED", "nobody waits for what does not go on"
+    wait_for(lambda: live.streams() == 1, "that stream is closed", timeout_s=10)
+    of_run = Following(f"{live.url}/v1/bulk/{bulk_id}/events")
+    of_run.await_lines("data:", 1)
     live.client.cancel_bulk(bulk_id)
     live.catalogue.jobs.complete(lease, "r" * 64)
     following.await_lines("data:", 5)  # both ends
+    of_run.join(10)
+    assert of_run.said("event:") == ["progress", "end"]
     live.client.delete_bulk(bulk_id)
     wait_for(lambda: following.said("event:")[-1] == "gone", "the deletion", timeout_s=10)
     *told, gone = [json.loads(data) for data in following.said("data:")]
@@ -442,19 +396,6 @@ def test_a_stream_follows_jobs_and_bulk_runs(live: Live) -> None:
     live.app.state.stopping = True
     following.join(5)
     assert not following.is_alive(), "a server that stops ends its streams"
-
-
-def test_many_jobs_come_in_one_stream_and_streams_are_counted_together(live: Live) -> None:
-    ids = [submitted(live.catalogue) for _ in range(50)]
-    both = [Following(f"{live.url}/v1/events") for _ in range(2)]
-    for one in both:
-        one.await_lines("data:", 50)
-        assert {json.loads(data)["id"] for data in one.said("data:")} == set(ids)
-    for address in ("/v1/events", f"/v1/jobs/{ids[0]}/events"):
-        with httpx.stream("GET", f"{live.url}{address}") as answer:
-            assert answer.status_code == 429  # the body of an accepted stream would never end
-            answer.read()
-            refusal(answer, 429, "too-many-streams")
 
 
 def once(api: TestClient, **request: Any) -> tuple[list[tuple[str, dict[str, Any]]], str]:

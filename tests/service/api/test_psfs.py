@@ -8,7 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from astropy.io import fits
 from fastapi.testclient import TestClient
@@ -84,14 +83,9 @@ CHANGES: list[tuple[Any, int, str]] = [
     (GOOD | {"valid_from": "2021-13-01"}, 422, "bad-time"),
     (GOOD | {"valid_to": "9999-12-31T23:59:59.999999999"}, 422, "bad-time"),
     (GOOD | {"valid_from": "last year"}, 422, "invalid-request"),
-    (GOOD | {"valid_from": 2021}, 422, "invalid-request"),
     (GOOD | {"supersedes": ["x"]}, 422, "invalid-request"),
     (GOOD | {"kind": "A B"}, 422, "invalid-request"),
-    (GOOD | {"reason": "x" * 401}, 422, "invalid-request"),
-    (GOOD | {"reason": "a\x00b"}, 422, "invalid-request"),
-    (GOOD | {"status": "released"}, 422, "invalid-request"),
     (GOOD | {"approved_by": "me"}, 422, "invalid-request"),
-    ([], 422, "invalid-request"),
 ]
 
 
@@ -99,17 +93,17 @@ def test_invalid_changes_of_status_are_refused(api: TestClient, psfs: list[str])
     here = f"/v1/psfs/{psfs[0]}/status"
     for body, status, code in CHANGES:
         refusal(api.post(here, json=body), status, code)
-        now = api.get(here).json()
-        assert now["status"] == "draft" and now["history"] == [], body
+    now = api.get(here).json()
+    assert now["status"] == "draft" and now["history"] == []
     refusal(api.post(f"/v1/psfs/{psfs[0]}/rerun"), 409, "not-made-here")
     told = api.get(f"/v1/psfs/{psfs[0]}/lineage").json()
     assert told["parents"] == [] and told["made"]["origin"] == "uploaded"
 
 
-def test_lists_by_properties_and_validity(api: TestClient, psfs: list[str]) -> None:
+def test_lists_and_the_best_by_properties_and_validity(api: TestClient, psfs: list[str]) -> None:
+    """What each property selects is tested in tests/workers/catalogue."""
     certify(api, psfs[0], "1.0.0", 2020, 2021)
     certify(api, psfs[1], "1.1.0", 2021, 2022)
-    certify(api, psfs[3], "1.0.0", 2020, None)
 
     def ids(**query: str) -> list[str]:
         answer = api.get("/v1/psfs", params=query)
@@ -117,31 +111,24 @@ def test_lists_by_properties_and_validity(api: TestClient, psfs: list[str]) -> N
         return [item["id"] for item in answer.json()["items"]]
 
     api.post("/v1/contexts", json={"name": "c"})
-    certify(api, psfs[2], "1.2.0", 2022, 2023)
-    assert ids() == ids(context="now") == psfs[::-1]
-    assert ids(status="draft") == ids(name="none") == ids(instrument="aia") == []
-    assert ids(name="p64") == [psfs[2]] and ids(channel="304") == [psfs[3]]
-    assert ids(channel="174", kind="total", status="certified") == psfs[2::-1]
-    assert ids(version="1.0.0") == ids(valid_at="2020-12-31T23:59:59Z") == [psfs[3], psfs[0]]
-    assert ids(valid_at="2021-01-01", channel="174") == [psfs[1]]
-    assert ids(context="c") == [psfs[3], psfs[1], psfs[0]]
-    assert ids(context="c", valid_at="2021-06-01") == [psfs[3], psfs[1]]
+    assert ids() == psfs[::-1] and ids(context="now") == psfs[1::-1]
+    assert ids(name="p64") == [psfs[2]] and ids(channel="304") == [psfs[3]] and ids(instrument="aia") == []
+    assert ids(channel="174", kind="total", status="certified") == ids(context="c") == psfs[1::-1]
+    assert ids(version="1.0.0") == ids(valid_at="2020-12-31T23:59:59Z") == [psfs[0]]
     refusal(api.get("/v1/psfs", params={"context": "d"}), 404, "no-such-context")
     draft_at = {"valid_at": "2020-01-01", "status": "draft"}
-    for query in ({"valid_at": "2020"}, {"valid_at": "5"}, {"status": "released"}, draft_at):
+    for query in ({"valid_at": "2020"}, {"status": "released"}, draft_at):
         assert api.get("/v1/psfs", params=query).status_code == 422, query
     first = api.get("/v1/psfs", params={"channel": "174", "limit": 2}).json()
     assert [item["id"] for item in api.get(first["next"]).json()["items"]] == [psfs[0]]
 
-    # The best of them.
     line = {"instrument": "hri_euv", "channel": "174", "kind": "total"}
     one = api.get("/v1/psfs/best", params={**line, "valid_at": "2021-06-01T00:00"}).json()
     assert (one["psf"]["id"], one["context"], one["valid_at"]) == (psfs[1], None, "2021-06-01T00:00:00Z")
     several = api.get("/v1/psfs/best", params=line)
     detail = refusal(several, 409, "several-psfs-fit")
-    assert {one["id"] for one in several.json()["candidates"]} == set(psfs[:3]) and psfs[0] in detail
+    assert {one["id"] for one in several.json()["candidates"]} == set(psfs[:2]) and psfs[0] in detail
     refusal(api.get("/v1/psfs/best", params={**line, "valid_at": "2030-01-01"}), 404, "no-psf-fits")
-    refusal(api.get("/v1/psfs/best", params={"context": "none"}), 404, "no-such-context")
 
 
 def test_contexts_and_the_default(api: TestClient, psfs: list[str]) -> None:
@@ -155,27 +142,27 @@ def test_contexts_and_the_default(api: TestClient, psfs: list[str]) -> None:
     assert (pin["valid_from"], pin["valid_to"]) == ("2020-01-01T00:00:00Z", None) and not pin["interpolated"]
     again = api.post("/v1/contexts", json={"name": "early"})
     assert again.status_code == 200 and again.json() == context
-    certify(api, psfs[1], "2.0.0", 2020, None, supersedes=[psfs[0]])
-    refusal(api.post("/v1/contexts", json={"name": "early"}), 409, "name-taken")
     pins = [{"psf_id": psfs[2], "valid_from": "2020-01-01", "valid_to": "2021-01-01"}, {"psf_id": psfs[3]}]
+    refusal(api.post("/v1/contexts", json={"name": "early", "pins": pins}), 409, "name-taken")
     assert api.post("/v1/contexts", json={"name": "mine", "pins": pins}).status_code == 201
-    for name in (context["id"], "early"):
-        assert api.get(f"/v1/contexts/{name}").json() == context
+    assert api.get("/v1/contexts/early").json() == context
     assert [one["name"] for one in api.get("/v1/contexts").json()["items"]] == ["mine", "early"]
     refusal(api.get("/v1/contexts/late"), 404, "no-such-context")
 
     assert api.get("/v1/contexts/default").json() == {"context": None, "history": []}
-    moved = api.put("/v1/contexts/default", json={"context": "early", "reason": "go"}).json()
-    assert moved["context"]["id"] == context["id"]
-    assert api.get("/v1/psfs/best", params={"instrument": "hri_euv"}).json()["psf"]["id"] == psfs[0]
-    best_now = api.get("/v1/psfs/best", params={"instrument": "hri_euv", "context": "now"}).json()
-    assert best_now["psf"]["id"] == psfs[1] and best_now["context"] is None
+    moved = api.put("/v1/contexts/default", json={"context": "mine", "reason": "go"}).json()
+    assert moved["context"]["name"] == "mine"
+    best = {"instrument": "hri_euv", "channel": "304"}
+    assert api.get("/v1/psfs/best", params=best).json()["psf"]["id"] == psfs[3]
+    refusal(api.get("/v1/psfs/best", params={**best, "context": "now"}), 404, "no-psf-fits")
     api.put("/v1/contexts/default", json={"context": None})
     history = api.get("/v1/contexts/default").json()["history"]
-    assert [(one["context"], one["reason"]) for one in history] == [(None, ""), (context["id"], "go")]
+    assert [(one["context"], one["reason"]) for one in history] == [
+        (None, ""),
+        (moved["context"]["id"], "go"),
+    ]
     refusal(api.put("/v1/contexts/default", json={"context": "late"}), 404, "no-such-context")
-    wrong_names = ({"name": "now"}, {"name": "a b"}, {"name": ""}, {})
-    for body in (*wrong_names, {"name": "x", "pins": []}, {"name": "x", "of": 1}):
+    for body in ({"name": "now"}, {"name": "a b"}, {}, {"name": "x", "pins": []}, {"name": "x", "of": 1}):
         assert api.post("/v1/contexts", json=body).status_code in (409, 422), body
 
 
@@ -190,7 +177,6 @@ def test_an_image_is_deconvolved_with_the_psf_of_its_time(
         body = {"kind": "deconvolve", "parameters": {"image_id": image_id, **more}}
         return api.post("/v1/jobs", json=body)
 
-    assert asked(image).json()["parameters"]["psf_recipe"]["instrument"] == "hri_euv", "none is certified"
     refusal(api.get(f"/v1/images/{image}/psf"), 404, "no-psf-fits")
     certify(api, psfs[0], "1.0.0", 2020, 2021)
     choice = api.get(f"/v1/images/{image}/psf").json()
@@ -198,11 +184,9 @@ def test_an_image_is_deconvolved_with_the_psf_of_its_time(
     now = asked(image).json()["parameters"]
     assert (now["psf_id"], now["psf_recipe"], now["picked_for"]) == (psfs[0], None, "hri_euv")
     refusal(asked(far), 404, "no-psf-fits")
-
     api.post("/v1/contexts", json={"name": "c", "pins": [{"psf_id": psfs[2]}]})
-    pinned = asked(far, context="c").json()["parameters"]
-    assert pinned["psf_id"] == psfs[2] and pinned["context_id"] == api.get("/v1/contexts/c").json()["id"]
     assert api.get(f"/v1/images/{far}/psf", params={"context": "c"}).json()["psf"]["id"] == psfs[2]
+    assert asked(far, context="c").json()["parameters"]["psf_id"] == psfs[2]
     assert asked(far, context="c", psf_id=psfs[0]).status_code == 422
 
 
@@ -236,49 +220,35 @@ def test_products_of_a_superseded_psf_are_listed(
     certify(api, psfs[2], "2.0.0", supersedes=[new])
     items = api.get(f"/v1/psfs/{old}/affected", params={"limit": 1}).json()["items"]
     assert (items[0]["successor"], items[0]["redo_with"]) == (new, psfs[2])
-    for place in ("nonsense", f"{new} 1.0", f"{new} soon {old}", f"{new}\x00 1.0 {old}", f"{new} nan {old}"):
+    for place in ("nonsense", f"{new} soon {old}", f"{new}\x00 1.0 {old}", f"{new} nan {old}"):
         cursor = base64.urlsafe_b64encode(place.encode()).decode()
         assert api.get("/v1/affected", params={"cursor": cursor}).status_code == 422, place
 
 
-def test_lineage_and_rerun_of_a_built_psf(
-    api: TestClient, run_jobs: Callable[[], None], image_file: Path
+def test_lineage_and_rerun(
+    api: TestClient, run_jobs: Callable[[], None], image_file: Path, psf_file: Path
 ) -> None:
-    psf = result_of(api, run_jobs, "psf-build", instrument_file=SMALL_INSTRUMENT, size=64)
-    assert (psf["channel"], psf["kind"]) == ("171", "total")
-    body = {
-        "image_id": upload(api, image_file),
-        "psf_id": psf["id"],
-        "method": {"name": "linear", "steps": 1},
-    }
-    product = result_of(api, run_jobs, "deconvolve", **body)
-
+    """What a lineage and a rerun say is tested in tests/workers/tasks/test_rerun.py."""
+    body = {"image_id": upload(api, image_file), "psf_id": upload(api, psf_file, "/v1/psfs")}
+    product = result_of(api, run_jobs, "deconvolve", **body, method={"name": "linear", "steps": 1})
     told = api.get(f"/v1/products/{product['id']}/lineage").json()
     assert told["made"]["job_id"] == product["details"]["job_id"]
-    assert told["made"]["parameters"]["psf_id"] == psf["id"] and "numpy" in told["made"]["libraries"]
     image, parent = told["parents"]
     assert (image["type"], image["id"], image["there"]) == ("image", body["image_id"], True)
-    assert (parent["type"], parent["id"]) == ("psf", psf["id"])
-    assert parent == api.get(f"/v1/psfs/{psf['id']}/lineage").json()
-    assert parent["parents"][0]["type"] == "instrument-file"
+    assert parent == api.get(f"/v1/psfs/{body['psf_id']}/lineage").json()
 
-    for of, identity in (("products", product["id"]), ("psfs", psf["id"])):
-        asked = api.post(f"/v1/{of}/{identity}/rerun")
-        assert asked.status_code == 202, asked.text
-        again = api.post(f"/v1/{of}/{identity}/rerun").json()
-        assert again["id"] != asked.json()["id"]
-        assert api.delete(f"/v1/jobs/{again['id']}").json()["phase"] == "ABORTED"
-        run_jobs()
-        job = api.get(asked.headers["Location"]).json()
-        assert job["phase"] == "COMPLETED", job
-        report = api.get(job["result"]).json()
-        assert report["details"]["same"] is True and report["about_id"] == identity
-        written = api.get(report["file"]).json()
-        assert written["largest_relative_difference"] == 0.0 and written["sentence"]
-        assert api.get(report["output"]).content[:9] == b"SIMPLE  ="
-        listed = api.get("/v1/reports", params={"about_id": identity}).json()["items"]
-        assert [one["id"] for one in listed] == [report["id"]]
-    assert len(api.get("/v1/products").json()["items"]) == len(api.get("/v1/psfs").json()["items"]) == 1
+    asked = api.post(f"/v1/products/{product['id']}/rerun")
+    assert asked.status_code == 202, asked.text
+    again = api.post(f"/v1/products/{product['id']}/rerun").json()
+    assert again["id"] != asked.json()["id"]
+    assert api.delete(f"/v1/jobs/{again['id']}").json()["phase"] == "ABORTED"
+    run_jobs()
+    report = api.get(api.get(asked.headers["Location"]).json()["result"]).json()
+    assert report["details"]["same"] is True and report["about_id"] == product["id"]
+    assert api.get(report["file"]).json()["largest_relative_difference"] == 0.0
+    assert api.get(report["output"]).content[:9] == b"SIMPLE  ="
+    listed = api.get("/v1/reports", params={"about_id": product["id"]}).json()["items"]
+    assert [one["id"] for one in listed] == [report["id"]]
     assert api.get(f"/v1/reports/{'0' * 64}/output").status_code == 404
 
 
@@ -358,46 +328,18 @@ def test_a_psf_that_was_built_here(api: TestClient, run_jobs: Callable[[], None]
 
 
 def test_a_psf_in_use_is_not_deleted(
-    api: TestClient, run_jobs: Callable[[], None], image_file: Path, tmp_path: Path
+    api: TestClient, image_file: Path, psf_file: Path, run_jobs: Callable[[], None]
 ) -> None:
-    image_id = upload(api, image_file)
-    ids = []
-    for size in (16, 24, 32, 48, 64):
-        write_psf(tmp_path / f"{size}.fits", size=size)
-        series = {"instrument": "small", "channel": "171", "kind": "total"}
-        content = (tmp_path / f"{size}.fits").read_bytes()
-        ids.append(api.post("/v1/psfs", params=series, content=content).json()["id"])
-    product, waiting, bulk, pinned, certified = ids
-
-    def deconvolve(psf_id: str) -> None:
-        body = {"kind": "deconvolve", "parameters": {"image_id": image_id, "psf_id": psf_id, **FEW}}
-        assert api.post("/v1/jobs", json=body).status_code == 202
-
-    deconvolve(product)
-    run_jobs()
-    deconvolve(waiting)
-    assert api.post("/v1/bulk", json={"images": [image_id], "psf_id": bulk}).status_code == 202
-    assert api.post("/v1/contexts", json={"name": "c", "pins": [{"psf_id": pinned}]}).status_code == 201
-    status = {"status": "certified", "version": "1.0.0"}
-    assert api.post(f"/v1/psfs/{certified}/status", json=status).status_code == 200
-    for psf_id, code, word in (
-        (product, "psf-in-use", "product "),
-        (waiting, "psf-in-use", "job "),
-        (bulk, "psf-in-use", "bulk run "),
-        (pinned, "psf-in-use", "context "),
-        (certified, "not-a-draft", "certified"),
-    ):
-        assert word in refusal(api.delete(f"/v1/psfs/{psf_id}"), 409, code)
-        assert api.get(f"/v1/psfs/{psf_id}").status_code == 200
-    run_jobs()  # the job waits no longer, but its product uses the PSF
-    refusal(api.delete(f"/v1/psfs/{waiting}"), 409, "psf-in-use")
-
-    # A draft that only a failed job names can be deleted.
-    fits.PrimaryHDU(np.zeros((64, 64), "f4")).writeto(tmp_path / "dark.fits")
-    dark = upload(api, tmp_path / "dark.fits")
-    write_psf(tmp_path / "20.fits", size=20)
-    psf_id = upload(api, tmp_path / "20.fits", "/v1/psfs")
-    failed = job_after(api, run_jobs, "deconvolve", image_id=dark, psf_id=psf_id)
+    """What counts as a use is tested in tests/workers/catalogue/test_owners.py. A failed job is none."""
+    psf_id = upload(api, psf_file, "/v1/psfs")
+    body = {"image_id": upload(api, image_file), "psf_id": psf_id, **FEW}
+    waiting = api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": body}).json()["id"]
+    assert waiting[:12] in refusal(api.delete(f"/v1/psfs/{psf_id}"), 409, "psf-in-use")
+    api.delete(f"/v1/jobs/{waiting}")
+    fits.setval(image_file, "OBJECT", value="dark")
+    with fits.open(image_file, mode="update") as hdus:
+        hdus[0].data[:] = 0
+    failed = job_after(api, run_jobs, "deconvolve", image_id=upload(api, image_file), psf_id=psf_id)
     assert failed["error"]["code"] == "no-signal"
     assert api.delete(f"/v1/psfs/{psf_id}").status_code == 200
 
@@ -434,14 +376,8 @@ def test_a_psf_may_be_larger_than_the_largest_image(
     assert settings.max_upload_bytes < (tmp_path / "psf.fits").stat().st_size < settings.max_psf_bytes
     sent = (tmp_path / "psf.fits").read_bytes()
     refusal(api.post("/v1/images", content=sent), 413, "too-large")
-    named = {
-        "image_id": upload(api, tmp_path / "i.fits"),
-        "psf_id": upload(api, tmp_path / "psf.fits", "/v1/psfs"),
-    }
-    named |= {"method": {"name": "richardson-lucy", "steps": 1}}
-    job = api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": named}).json()
-    run_jobs()
-    assert api.get(f"/v1/jobs/{job['id']}").json()["phase"] == "COMPLETED"
+    image_id, psf_id = upload(api, tmp_path / "i.fits"), upload(api, tmp_path / "psf.fits", "/v1/psfs")
+    result_of(api, run_jobs, "deconvolve", image_id=image_id, psf_id=psf_id, **FEW)
     write_psf(tmp_path / "larger.fits", size=1026)
     monkeypatch.setattr(Settings, "psf_limits", FitsLimits(max_pixels=1024**2))
     refusal(api.post("/v1/psfs", content=(tmp_path / "larger.fits").read_bytes()), 422, "too-many-pixels")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -54,10 +55,6 @@ def image_at(api: TestClient, path: Path, date: str, seed: int = 1) -> str:
     return upload(api, path)
 
 
-def product_of(api: TestClient, run_jobs: Callable[[], None], image_id: str, **more: Any) -> dict[str, Any]:
-    return result_of(api, run_jobs, "deconvolve", image_id=image_id, method=QUICK, **more)
-
-
 def deconvolve(api: TestClient, image_id: str, **more: Any) -> Response:
     parameters = {"image_id": image_id, "method": QUICK, **more}
     return api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": parameters})
@@ -77,22 +74,17 @@ def test_an_image_between_two_psfs_is_deconvolved_with_a_psf_between_them(
     choice = api.post("/v1/estimates", json=body).json()["psf"]
     assert choice["status"] is None and "the job makes it first" in choice["why"]
 
-    product = product_of(api, run_jobs, image)
+    product = result_of(api, run_jobs, "deconvolve", image_id=image, method=QUICK)
     psf = api.get(f"/v1/psfs/{choice['id']}").json()
     assert product["psf_id"] == psf["id"]
     assert (psf["origin"], psf["status"], psf["name"]) == ("interpolated", "draft", "hri_euv-interpolated")
     assert psf["version"] == choice["version"] == product["psf_version"]
-    with fits.open(_file(api, f"/v1/products/{product['id']}/file", tmp_path)) as hdus:
-        header = hdus[0].header
-        assert (header["PSFID"], header["PSFVERS"]) == (psf["id"], psf["version"])
-        assert header["PSFNAME"] == "hri_euv-interpolated"
-
-    fit = psf["details"]["fit"]
-    middle = 0.5 * (
-        EARLY["total"] + LATE["total"]
-    )  # tests/psfcore/scatter/test_interpolation.py tests the curve
-    assert fit["parameters"]["total"]["value"] == pytest.approx(middle, abs=0.001)
-    assert max(fit["curve"]["sigma"]) > 1.0
+    file = io.BytesIO(api.get(product["file"]).content)
+    header = fits.getheader(file)
+    assert (header["PSFID"], header["PSFNAME"]) == (psf["id"], "hri_euv-interpolated")
+    # tests/psfcore/scatter/test_interpolation.py tests the curve
+    middle = 0.5 * (EARLY["total"] + LATE["total"])
+    assert psf["details"]["fit"]["parameters"]["total"]["value"] == pytest.approx(middle, abs=0.001)
 
     other = image_at(api, tmp_path / "j.fits", "2022-08-30T13:00:00", seed=2)
     again = api.get(deconvolve(api, other).headers["Location"]).json()
@@ -100,58 +92,19 @@ def test_an_image_between_two_psfs_is_deconvolved_with_a_psf_between_them(
     run_jobs()
     assert len(api.get("/v1/psfs").json()["items"]) == 3
 
-    # Lineage names both ends; a rerun gives the same PSF and product.
-    told = api.get(f"/v1/products/{product['id']}/lineage").json()
-    assert [one["type"] for one in told["parents"]] == ["image", "psf"]
-    between = told["parents"][1]
-    assert between["made"]["origin"] == "interpolated" and between["made"]["software_version"]
+    # Lineage names both ends with their weights; a rerun gives the same PSF.
+    between = api.get(f"/v1/products/{product['id']}/lineage").json()["parents"][1]
     assert [(one["type"], one["id"]) for one in between["parents"]] == [("psf", one) for one in ends]
     weights = [one["weight"] for one in between["parents"]]
     # The nearest midnight is that of 31 August, 183 of the 365 days after 1 March 2022.
     assert weights == pytest.approx([182 / 365, 183 / 365]) and between["weight"] is None
     parameters = between["made"]["parameters"]
     assert (parameters["before_psf_id"], parameters["time"]) == (ends[0], "2022-08-31T00:00:00Z")
-    hashes = [one["made"]["file_sha256"] for one in between["parents"]]
-    said = psf["details"]["provenance"]["interpolated_between"]
-    assert [one["file_sha256"] for one in said] == hashes == list(ends), "an upload's id is its hash"
-    assert [(one["name"], one["version"]) for one in said] == [("fitted", "1.0.0"), ("fitted", "1.1.0")]
     rerun = api.post(f"/v1/psfs/{psf['id']}/rerun")
-    assert rerun.status_code == 202, rerun.text
     run_jobs()
-    done = api.get(rerun.headers["Location"]).json()
-    assert done["phase"] == "COMPLETED", done
-    details = api.get(done["result"]).json()["details"]
+    details = api.get(api.get(rerun.headers["Location"]).json()["result"]).json()["details"]
     assert details["same"] is True and details["same_file"] is True
     assert api.get(f"/psfs/{psf['id']}", headers={"Accept": "text/html"}).status_code == 200
-
-
-def _file(api: TestClient, address: str, folder: Path) -> Path:
-    answer = api.get(address)
-    assert answer.status_code == 200, answer.text
-    path = folder / f"{address.replace('/', '_')}.fits"
-    path.write_bytes(answer.content)
-    return path
-
-
-def test_when_an_end_is_deprecated_so_are_its_psfs_but_a_context_still_uses_it(
-    api: TestClient, run_jobs: Callable[[], None], ends: tuple[str, str], tmp_path: Path
-) -> None:
-    api.put(SERIES, json={"interpolated": True})
-    assert api.post("/v1/contexts", json={"name": "c"}).status_code == 201
-    image = image_at(api, tmp_path / "i.fits", "2022-08-30")
-    product = product_of(api, run_jobs, image)
-    assert api.get("/v1/affected").json()["items"] == []
-    api.post(f"/v1/psfs/{ends[1]}/status", json={"status": "deprecated", "reason": "wrong mesh"})
-    (item,) = api.get("/v1/affected").json()["items"]
-    assert (item["product_id"], item["psf_status"]) == (product["id"], "deprecated")
-    refusal(deconvolve(api, image), 404, "no-psf-fits")
-
-    # The context still uses its pins, also for a PSF that is made only now; the product warns.
-    other = image_at(api, tmp_path / "j.fits", "2022-04-01", seed=2)
-    made = product_of(api, run_jobs, other, context="c")
-    (warning,) = [one for one in made["details"]["warnings"] if one["code"] == "psf-deprecated"]
-    assert "interpolated from PSF" in warning["message"] and "wrong mesh" in warning["message"]
-    assert [pin["interpolated"] for pin in api.get("/v1/contexts/c").json()["pins"]] == [True, True]
 
 
 def between(before: str, after: str) -> dict[str, str]:
@@ -162,13 +115,9 @@ def between(before: str, after: str) -> dict[str, str]:
 def test_ends_that_do_not_fit_end_the_job_with_the_reason(
     api: TestClient, run_jobs: Callable[[], None], ends: tuple[str, str], tmp_path: Path
 ) -> None:
-    knee = upload(api, write_fitted(tmp_path / "knee.fits", LATE | {"bend": 0.1}, shape="knee"), TOTAL)
     plain = upload(api, write_fitted(tmp_path / "plain.fits", LATE, fitted=None), TOTAL)
-    cases = ((knee, "shapes-differ", "softened-power-law"), (plain, "psf-not-fitted", "heliopsf psf fit"))
-    for other, code, words in cases:
-        done = job_after(api, run_jobs, "psf-interpolate", **between(ends[0], other))
-        assert (done["phase"], done["error"]["fault"], done["error"]["code"]) == ("ERROR", "user", code), done
-        assert words in done["error"]["message"]
+    error = job_after(api, run_jobs, "psf-interpolate", **between(ends[0], plain))["error"]
+    assert (error["fault"], error["code"]) == ("user", "psf-not-fitted")
     for wrong, status in ((between(ends[0], "0" * 64), 404), (between(*ends) | {"time": "2024-01-01"}, 422)):
         body = {"kind": "psf-interpolate", "parameters": wrong}
         assert api.post("/v1/jobs", json=body).status_code == status
@@ -186,10 +135,7 @@ def test_invalid_changes_of_a_series_are_refused(api: TestClient, ends: tuple[st
     for address, body, status, code in (
         ("/v1/series/fsi/174/total", {"interpolated": True}, 404, "no-such-series"),
         ("/v1/series/HRI/174/total", {"interpolated": True}, 422, "invalid-request"),
-        (SERIES, {"interpolated": "perhaps"}, 422, "invalid-request"),
-        (SERIES, {}, 422, "invalid-request"),
         (SERIES, {"interpolated": True, "step": 1}, 422, "invalid-request"),
-        (SERIES, {"interpolated": True, "reason": "a\x00b"}, 422, "invalid-request"),
     ):
         refusal(api.put(address, json=body), status, code)
     assert api.get(SERIES).json() == {"series": "hri_euv/174/total", "interpolated": False, "history": []}

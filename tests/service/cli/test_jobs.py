@@ -107,10 +107,8 @@ def test_a_name_that_the_service_sends_leads_out_of_no_folder_and_controls_no_te
     printed = command("product", "list")
     for name, expected in (
         ("../../x.fits", "x.fits"),
-        ("/etc/x.fits", "x.fits"),
         ("..\\..\\x.fits", "x.fits"),
         ("..", "result.fits"),
-        ("", "result.fits"),
         (".bashrc", "bashrc"),
         ("a\x1b[2J.fits", "a[2J.fits"),
     ):
@@ -140,12 +138,9 @@ def test_jobs_are_cancelled_and_a_wait_for_several_ends_with_1_if_one_failed(
     assert "the id of one of your jobs, or its first" in command("job", "wait", "01234567", code=1)
 
 
-def test_a_text_that_cannot_be_an_id_is_refused_before_a_request(
-    subtests: pytest.Subtests, command: Command
-) -> None:
+def test_a_text_that_cannot_be_an_id_is_refused_before_a_request(command: Command) -> None:
     for identity in ("0123456", "../../metrics", "x" * 12):
-        with subtests.test(str(identity)):
-            assert "expected an id, or its first 8 or more" in command("job", "show", identity, code=2)
+        assert "expected an id, or its first 8 or more" in command("job", "show", identity, code=2)
 
 
 def test_psfs_are_downloaded_and_named_by_short_ids(
@@ -159,6 +154,8 @@ def test_psfs_are_downloaded_and_named_by_short_ids(
     write_psf(tmp_path / "other.fits", size=48)
     other = upload(api, tmp_path / "other.fits", "/v1/psfs")
     assert " minus " in command("psf", "query", short(psf), "--compare", short(other))
+    mixed = command("psf", "query", short(psf), "--compare", psf_file, code=2)
+    assert "expected two PSF ids or two files" in mixed
     assert "central 9 x 9 px" in command("psf", "cutout", short(psf), "--size", 9, "-o", tmp_path / "c.fits")
     assert "px of 2 x 2" in command("psf", "rebin", short(psf), "--factor", 2, "-o", tmp_path / "r.fits")
     assert command("psf", "lineage", short(psf)).startswith(f"psf {short(psf)}")

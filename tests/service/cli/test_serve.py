@@ -14,7 +14,7 @@ from fastapi.testclient import TestClient
 from service.app import create_app
 from service.cli import serve
 from service.cli.main import main
-from tests.service.conftest import upload
+from tests.service.conftest import result_of, upload
 from workers.settings import Settings
 
 
@@ -32,9 +32,7 @@ def test_the_command_that_the_demo_tells_shows_its_product(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     inputs = {"image_id": upload(api, image_file), "psf_id": upload(api, psf_file, "/v1/psfs")}
-    job = api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": inputs}).json()
-    run_jobs()
-    product = api.get(api.get(f"/v1/jobs/{job['id']}").json()["result"]).json()
+    product = result_of(api, run_jobs, "deconvolve", **inputs)
     files = image_file.with_name("product.fits"), image_file.with_name("picture.png")
     lines = serve.demo_lines(settings.data_dir.parent, image_file, *files, product)
     (command,) = [line for line in lines if " serve " in line]
@@ -61,7 +59,7 @@ def test_a_demo_replaces_only_the_files_of_a_demo(tmp_path: Path, monkeypatch: p
         assert CliRunner().invoke(main, ["demo", "-o", str(folder)]).exit_code == 0
 
 
-def test_a_browser_is_sent_to_an_address_that_it_can_open(subtests: pytest.Subtests) -> None:
+def test_a_browser_is_sent_to_an_address_that_it_can_open() -> None:
     for listens, open in (
         ("http://127.0.0.1:8765", "http://127.0.0.1:8765"),
         ("http://[::1]:80", "http://[::1]:80"),
@@ -69,5 +67,4 @@ def test_a_browser_is_sent_to_an_address_that_it_can_open(subtests: pytest.Subte
         ("http://0.0.0.0:8765", "http://localhost:8765"),
         ("http://[::]:8765", "http://localhost:8765"),
     ):
-        with subtests.test(str((listens, open))):
-            assert serve.browser_address(listens) == open
+        assert serve.browser_address(listens) == open

@@ -6,13 +6,12 @@ import json
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
 from astropy.io import fits
 from click.testing import CliRunner, Result
 
 from service.cli.main import main
-from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
+from tests.conftest import write_image, write_psf
 
 SMALL = ("--size", "64", "--images", "3")
 
@@ -50,19 +49,10 @@ def test_a_folder_is_written_with_its_truth(made: Path) -> None:
 def test_the_diffraction_psf_of_a_folder_is_not_deconvolved(
     made: Path, diffraction: Path, tmp_path: Path
 ) -> None:
-    line = [
-        "deconvolve",
-        made,
-        "-o",
-        tmp_path / "out",
-        "--psf",
-        diffraction,
-        "--other-channel",
-        "--steps",
-        1,
-        "--local",
-    ]
-    done = CliRunner().invoke(main, [str(word) for word in line])
+    how = ("--psf", diffraction, "--other-channel", "--steps", 1, "--local")
+    done = CliRunner().invoke(
+        main, [str(word) for word in ("deconvolve", made, "-o", tmp_path / "out", *how)]
+    )
     assert f"failed: {made}/diffraction.fits: expected an image; the header (PSFSUM)" in done.output
     assert "4 images: 3 deconvolved, 0 existed already, 1 failed" in done.output
 
@@ -89,74 +79,34 @@ def test_what_is_asked_for_is_simulated(tmp_path: Path, diffraction: Path) -> No
     assert fits.getdata(tmp_path / "t/scenes/fov1.fits").shape == (128, 128)
 
 
-def test_an_image_gives_the_scene(tmp_path: Path, diffraction: Path) -> None:
-    write_image(tmp_path / "sun.fits", shape=(160, 160), BUNIT="DN", XPOSURE=2.0)
-    result = run(
-        "transit",
-        "-o",
-        tmp_path / "t",
-        *SMALL,
-        "--diffraction",
-        diffraction,
-        "--scene",
-        tmp_path / "sun.fits",
-    )
-    assert result.exit_code == 0, result.output
-    image = np.float64(fits.getdata(tmp_path / "sun.fits"))[16:144, 16:144] / 2.0
-    expected = image.reshape(64, 2, 64, 2).mean(axis=(1, 3))
-    np.testing.assert_allclose(fits.getdata(tmp_path / "t/scenes/fov1.fits"), expected, rtol=1e-5)
-    np.testing.assert_allclose(fits.getdata(tmp_path / "t/scenes/fov3.fits"), expected[:, ::-1], rtol=1e-5)
-
-
-def test_the_diffraction_of_an_instrument_is_built(tmp_path: Path) -> None:
-    (tmp_path / "small.toml").write_text(SMALL_INSTRUMENT)
-    result = run(
-        "transit",
-        "-o",
-        tmp_path / "t",
-        *SMALL,
-        "--instrument",
-        tmp_path / "small.toml",
-        "--diffraction-size",
-        "96",
-    )
-    assert result.exit_code == 0, result.output
-    kernel = fits.getdata(tmp_path / "t/diffraction.fits")
-    assert kernel.shape == (96, 96)
-    assert kernel.sum(dtype=np.float64) == pytest.approx(1, abs=1e-6)
-
-
 def test_a_folder_in_use_is_left_alone(made: Path, diffraction: Path, tmp_path: Path) -> None:
     used = shutil.copytree(made, tmp_path / "used")
     before = (used / "truth.json").read_bytes()
     again = ("transit", "-o", used, *SMALL, "--diffraction", diffraction, "--seed", "2")
     refused = run(*again)
     assert refused.exit_code == 1 and "not empty" in refused.output
+    nowhere = run("transit", "-o", tmp_path / "no/such/folder", *SMALL)
+    assert nowhere.exit_code == 1 and "there is no folder" in nowhere.output
     assert (used / "truth.json").read_bytes() == before
     forced = run(*again, "--overwrite")
     assert forced.exit_code == 0, forced.output
     assert (used / "truth.json").read_bytes() != before
 
 
-def test_what_cannot_be_is_refused_in_a_line(subtests: pytest.Subtests, tmp_path: Path) -> None:
+def test_what_cannot_be_is_refused_in_a_line(tmp_path: Path) -> None:
     for options, said in (
         (["--c", "-1"], "c > 0"),
-        (["--total", "1.5"], "total < 1"),
-        (["--total", "nan"], "finite"),
-        (["--dipole", "2"], "dipole"),
-        (["--saturation", "0"], "saturation"),
         (["--size", "32"], "64<=x"),
         (["--images", "0"], "1<=x"),
         (["--diffraction-size", "97"], "even size"),
         (["--instrument", "no-such"], "no-such"),
         (["--diffraction", "missing.fits"], "missing.fits"),
     ):
-        with subtests.test(str((options, said))):
-            result = run("transit", "-o", tmp_path / "t", *SMALL, *options)
-            assert result.exit_code in (1, 2)
-            assert said in result.output
-            assert "Traceback" not in result.output and isinstance(result.exception, SystemExit)
-            assert not (tmp_path / "t").exists()
+        result = run("transit", "-o", tmp_path / "t", *SMALL, *options)
+        assert result.exit_code in (1, 2)
+        assert said in result.output
+        assert "Traceback" not in result.output and isinstance(result.exception, SystemExit)
+        assert not (tmp_path / "t").exists()
 
 
 def test_files_that_do_not_fit_are_refused(tmp_path: Path, diffraction: Path) -> None:
@@ -167,8 +117,3 @@ def test_files_that_do_not_fit_are_refused(tmp_path: Path, diffraction: Path) ->
     two = ("--scene", tmp_path / "sun.fits", "--scene", tmp_path / "sun.fits")
     result = run("transit", "-o", tmp_path / "t", *SMALL, "--diffraction", diffraction, *two)
     assert result.exit_code == 1 and "expected one scene image, or 3" in result.output
-
-
-def test_output_that_cannot_be_written_is_said_first(tmp_path: Path) -> None:
-    result = run("transit", "-o", tmp_path / "no/such/folder", *SMALL)
-    assert result.exit_code == 1 and "there is no folder" in result.output

@@ -16,15 +16,15 @@ from service.client import errors, http
 from service.client.errors import ServiceError, WaitInterrupted, service_address
 from service.client.http import Client
 from tests.conftest import write_image, write_psf
-from tests.service.api.live import running
 from tests.service.keyed import Keyed
+from tests.service.serving import running
 from workers.catalogue.access import Scope
 from workers.settings import Settings
 
 
-def test_a_service_of_this_machine_needs_no_scheme() -> None:
+def test_addresses_of_services() -> None:
+    """One of this machine needs no scheme; other addresses are refused with an example."""
     for said, url in (
-        ("localhost:8791", "http://localhost:8791"),
         (" 127.0.0.1:8791 ", "http://127.0.0.1:8791"),
         ("[::1]:8791", "http://[::1]:8791"),
         ("localhost", "http://localhost"),
@@ -32,15 +32,10 @@ def test_a_service_of_this_machine_needs_no_scheme() -> None:
         ("https://sun.example/heliopsf", "https://sun.example/heliopsf"),
     ):
         assert service_address(said) == url
-
-
-def test_other_addresses_are_refused_with_an_example() -> None:
     for said, told in (
         ("sun.example:8765", "write https://sun.example:8765"),
         ("10.0.0.7:8765", "https://10.0.0.7:8765"),
         ("ftp://localhost", "expected the address of a service"),
-        ("localhost:port", "expected the address of a service"),
-        ("http://", "expected the address of a service"),
         ("local host:1", "expected the address of a service"),
         ("http://localhost:99999", "expected the address of a service"),
         ("[::1:8791", "expected the address of a service"),
@@ -57,7 +52,6 @@ def test_an_error_says_how_to_start_a_service_at_this_address() -> None:
     for server, told in (
         ("localhost:8765", "`heliopsf serve` starts"),
         ("localhost:9321", "`heliopsf serve --port 9321` starts"),
-        ("http://[::1]:9321", "`heliopsf serve --port 9321` starts"),
         ("http://localhost", "`heliopsf serve --port 80` starts"),
         ("https://localhost:9321", "ask the operator"),
         ("http://sun.example:8765", "ask the operator"),
@@ -133,18 +127,14 @@ def test_a_lost_service_is_told_once_and_rejoined(slept: list[float]) -> None:
     assert waits == sorted(waits) and waits[1] == 2 * waits[0] and max(waits) == errors.LONGEST_WAIT_S
 
 
-def test_a_service_that_stays_away_is_given_up(slept: list[float]) -> None:
-    said: list[str] = []
-    with pytest.raises(ServiceError, match="no answer"):
-        client_of([nothing], said).wait(job("EXECUTING"))
-    assert len(said) == 1 and errors.PATIENCE_S < sum(slept) < 2 * errors.PATIENCE_S
-
-
-def test_a_refusal_is_not_repeated(slept: list[float]) -> None:
+def test_a_service_that_stays_away_is_given_up_and_a_refusal_is_not_repeated(slept: list[float]) -> None:
     said: list[str] = []
     with pytest.raises(ServiceError):
         client_of([lambda: httpx.Response(404)], said).wait(job("EXECUTING"))
     assert said == [] and len(slept) == 1
+    with pytest.raises(ServiceError, match="no answer"):
+        client_of([nothing], said).wait(job("EXECUTING"))
+    assert len(said) == 1 and errors.PATIENCE_S < sum(slept) < 2 * errors.PATIENCE_S
 
 
 def test_a_job_that_stays_in_the_queue_is_told_once(slept: list[float]) -> None:
@@ -217,13 +207,9 @@ def product_id(client: Client, image_id: str, psf_id: str, run_jobs: Callable[[]
 
 def test_contents_of_files(client: Client, image_id: str, product_id: str, tmp_path: Path) -> None:
     stored = fits.getdata(tmp_path / "sun.fits").astype(np.float32)
-    whole = client.pixels("image", image_id)
-    np.testing.assert_array_equal(whole, stored)
-    assert whole.dtype == np.float32 and whole.flags.writeable
     part = client.pixels("image", image_id, x=4, y=8, width=20, height=10)
     np.testing.assert_array_equal(part, stored[8:18, 4:24])
-    means = client.pixels("image", image_id, step=4)
-    np.testing.assert_allclose(means, stored.reshape(12, 4, 16, 4).mean((1, 3)), rtol=1e-6)
+    assert part.dtype == np.float32 and part.flags.writeable
     client.download(f"/v1/products/{product_id}/file", tmp_path / "product.fits")
     quality = client.pixels("product", product_id, "quality")
     np.testing.assert_array_equal(quality, fits.getdata(tmp_path / "product.fits", "QUALITY"))
@@ -235,34 +221,20 @@ def test_contents_of_files(client: Client, image_id: str, product_id: str, tmp_p
     [primary] = client.image_header(image_id)
     header = fits.getheader(tmp_path / "sun.fits")
     assert [card[0] for card in primary["cards"]] == [card.keyword for card in header.cards]
-    assert ["TELESCOP", header["TELESCOP"], header.comments["TELESCOP"]] in primary["cards"]
     listed = client.product_header(product_id)
-    assert [one["index"] for one in listed] == list(range(len(listed)))
     assert "QUALITY" in [one["name"] for one in listed]
     assert "DCNVMETH" in {card[0] for card in listed[0]["cards"]}
     client.thumbnail(product_id, tmp_path / "small.png")
     assert (tmp_path / "small.png").read_bytes().startswith(PNG)
 
 
-def test_an_estimate_starts_no_job(client: Client, image_id: str, psf_id: str) -> None:
-    asked = {"image_id": image_id, "psf_id": psf_id, "method": {"name": "linear"}}
-    told = client.estimate("deconvolve", **asked)
-    assert told["psf"]["id"] == psf_id and told["estimate"]["seconds"] > 0 and told["existing"] is None
-    assert told["result_id"] == client.result_id("deconvolve", **asked)
-    assert list(client.jobs()) == []
-
-
 def test_keys_are_made_listed_and_revoked(service: Keyed) -> None:
     own = service.key("ann", Scope.READ, Scope.SUBMIT)
     with Client("http://testserver", key=own, transport=service.api._transport) as client:
         made = client.make_key(["read"], label="laptop", lasts_days=2)
-        listed = list(client.keys())
+        listed = client.keys()
         assert [one["id"] for one in listed] == [made["id"], own.split("_")[1]]
-        assert listed[0]["label"] == "laptop" and "key" not in listed[0]
         assert client.revoke_key(made["id"])["state"] == "revoked"
-        with pytest.raises(ServiceError) as unknown:
-            client.revoke_key("0" * 16)
-        assert unknown.value.code == "no-such-key"
 
 
 def test_the_events_of_an_owner_tell_of_every_job_and_of_named_ones(settings: Settings) -> None:

@@ -54,32 +54,23 @@ def test_a_file_that_exists_is_replaced_only_if_told(tmp_path: Path) -> None:
     assert old.read_text() == "new" and list(tmp_path.iterdir()) == [old]
 
 
-def test_a_file_that_appears_during_the_work_is_kept(tmp_path: Path) -> None:
+def test_work_that_fails_and_a_file_that_appears_meanwhile_leave_what_was_there(tmp_path: Path) -> None:
     target = tmp_path / "target"
     with pytest.raises(ServiceError) as caught, written(target) as partial:
         partial.write_text("mine")
         target.write_text("theirs")
     assert caught.value.code == "output-exists"
+    with pytest.raises(OSError, match="broken"), written(target, overwrite=True) as partial:
+        partial.write_text("half")
+        raise OSError("broken")
     assert target.read_text() == "theirs" and list(tmp_path.iterdir()) == [target]
 
 
-def test_work_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
-    old = tmp_path / "old"
-    old.write_text("old")
-    with pytest.raises(OSError, match="broken"), written(old, overwrite=True) as partial:
-        partial.write_text("half")
-        raise OSError("broken")
-    assert old.read_text() == "old" and list(tmp_path.iterdir()) == [old]
-
-
-def test_a_link_stays_a_link(tmp_path: Path) -> None:
+def test_a_link_stays_a_link_and_a_device_is_not_replaced(tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to(tmp_path / "target")
     with written(tmp_path / "link") as partial:
         partial.write_text("content")
     assert (tmp_path / "link").is_symlink() and (tmp_path / "target").read_text() == "content"
-
-
-def test_a_device_is_written_and_not_replaced() -> None:
     with written(os.devnull) as partial:
         assert partial == Path(os.devnull)
     assert Path(os.devnull).is_char_device()

@@ -72,46 +72,25 @@ def cards(*lines: str) -> bytes:
     return padded(b"".join(line.ljust(80).encode() for line in (*lines, "END")), b" ")
 
 
-def primary(bitpix: object = 16, *axes: object, more: tuple[str, ...] = ()) -> bytes:
+def primary(bitpix: int, *axes: int) -> bytes:
     """The header of an image."""
     sizes = [f"NAXIS{n:<3}= {axis:>20}" for n, axis in enumerate(axes, 1)]
-    return cards(
-        "SIMPLE  =                    T",
-        f"BITPIX  = {bitpix:>20}",
-        f"NAXIS   = {len(axes):>20}",
-        *sizes,
-        *more,
-    )
+    first = "SIMPLE  =                    T"
+    return cards(first, f"BITPIX  = {bitpix:>20}", f"NAXIS   = {len(axes):>20}", *sizes)
 
 
-def written(*hdus: Any) -> bytes:
-    """The HDUs as a file."""
-    file = io.BytesIO()
-    fits.HDUList(list(hdus)).writeto(file)
-    return file.getvalue()
-
-
-def tiles(px: int, codec: str = "GZIP_1") -> bytes:
+def tiles(px: int) -> bytes:
     """An honest file of zeros in compressed tiles: px * px pixels of 16 bits, a tile a row, all of one stream."""
     stream = gzip.compress(bytes(2 * px))
     rows = np.zeros(px, dtype=[("COMPRESSED_DATA", ">i4", (2,))])
     rows["COMPRESSED_DATA"][:, 0] = len(stream)
     header = fits.open(io.BytesIO(lying_tiles(stream)), disable_image_compression=True)[1].header
-    header.update(NAXIS2=px, PCOUNT=len(stream), ZNAXIS1=px, ZNAXIS2=px, ZTILE1=px, ZCMPTYPE=codec)
+    header.update(NAXIS2=px, PCOUNT=len(stream), ZNAXIS1=px, ZNAXIS2=px, ZTILE1=px)
     return (
         fits.PrimaryHDU().header.tostring().encode()
         + header.tostring().encode()
         + padded(rows.tobytes() + stream)
     )
-
-
-def changed_tiles(**changes: object) -> bytes:
-    """A small file of tiles whose header says something else."""
-    content = lying_tiles(gzip.compress(bytes(128)))
-    for key, value in changes.items():
-        at = content.index(f"{key:<8}=".encode())
-        content = content[:at] + f"{key:<8}= {value!s:>20}".ljust(80).encode() + content[at + 80 :]
-    return content
 
 
 def long_header(mib: int) -> bytes:
@@ -124,28 +103,15 @@ EMPTY_IMAGE = cards(
 )
 FILES = [
     image("half a megabyte of tiles for 537 of pixels", 422, "too-many-pixels", lambda: tiles(16384)),
-    image("tiles of a codec that is not taken", 422, "codec-not-allowed", lambda: tiles(64, "HCOMPRESS_1")),
-    image("tiles larger than any image", 422, "bad-tiles", lambda: changed_tiles(ZTILE1=2**31)),
-    image("a heap that is not there", 422, "truncated-data", lambda: changed_tiles(PCOUNT=10**9)),
     image("60000 x 60000 pixels", 422, "too-many-pixels", lambda: primary(16, 60_000, 60_000)),
-    image("2^40 x 2^40 pixels", 422, "too-many-pixels", lambda: primary(8, 2**40, 2**40)),
-    image("pixels beyond counting", 422, "bad-card", lambda: primary(8, 10**30, 10**30)),
-    image("999 axes", 422, "not-2d", lambda: primary(8, *([1] * 999)) + bytes(2880)),
-    image("a size larger than the file", 422, "truncated-data", lambda: primary(16, 512, 512) + bytes(2880)),
-    image("a file that only begins like FITS", 422, "truncated-header", lambda: b"SIMPLE  =" + b"x" * 5000),
-    image("a table alone", 422, "table-only", lambda: written(fits.PrimaryHDU(), fits.BinTableHDU.from_columns([fits.Column("A", "E", array=np.ones(3))]))),
-    image("6 MB of cards", 422, "header-too-long", lambda: long_header(6)),
     image("100 MB of cards in gzip", 422, "header-too-long", lambda: gzip.compress(long_header(100), 1)),
     image("thousands of HDUs", 422, "too-many-hdus", lambda: cards("SIMPLE  =                    T", "BITPIX  = 8", "NAXIS   = 0") + 2500 * EMPTY_IMAGE),
     image("gzip that declares 300 GB", 422, "too-many-bytes", lambda: gzip.compress(primary(8, 10**5, 10**5, 30) + bytes(10**6))),
     image("gzip of gzip", 422, "not-fits", lambda: gzip.compress(gzip.compress(primary(8, 8, 8)))),
-    image("gzip that breaks off", 422, "truncated-gzip", lambda: gzip.compress(np.random.default_rng(0).bytes(99_999))[:2000]),
-    image("an image in a zip", 415, "not-fits", lambda: zipped(("x.fits", primary(8, 8, 8) + bytes(2880)))),
-    image("letters above ASCII in the header", 422, "bad-card", lambda: primary(8, 64, 64).replace(b"64  ", b"\xff\xfe\xfd ", 1)),
     image("a script", 415, "not-fits", lambda: b"#!/bin/sh\nrm -rf /\n" * 500),
     image("more than may be sent", 413, "too-large", lambda: b"SIMPLE  =" + bytes(9 * MIB)),
     image("nothing", 400, "empty-upload", lambda: b""),
-    image("a cube", 422, "three-axes", lambda: written(fits.PrimaryHDU(np.zeros((2, 8, 8), "u1")))),
+    image("a cube", 422, "three-axes", lambda: primary(8, 8, 8, 2) + bytes(2880)),
 ]  # fmt: skip
 
 
@@ -154,11 +120,13 @@ FILES = [
 SMALL_FITS = primary(8, 8, 8) + bytes(2880)
 
 
-def manifest(**changes: Any) -> bytes:
-    """The transit.json of one image."""
-    entry = {"file": "0.fits", "fov": 1, "x": 4.0, "y": 4.0, "r": 2.0}
-    content = {"schema": "transit/1", "instrument": "hri_euv", "images": [entry]}
-    return json.dumps(content | changes).encode()
+MANIFEST = json.dumps(
+    {
+        "schema": "transit/1",
+        "instrument": "hri_euv",
+        "images": [{"file": "0.fits", "fov": 1, "x": 4.0, "y": 4.0, "r": 2.0}],
+    }
+).encode()
 
 
 def zipped(*members: tuple[str, bytes]) -> bytes:
@@ -170,9 +138,9 @@ def zipped(*members: tuple[str, bytes]) -> bytes:
     return file.getvalue()
 
 
-def transit_zip(*more: tuple[str, bytes], **changes: Any) -> bytes:
+def transit_zip(*more: tuple[str, bytes]) -> bytes:
     """The archive of a transit with more in it."""
-    return zipped(("transit.json", manifest(**changes)), ("0.fits", SMALL_FITS), *more)
+    return zipped(("transit.json", MANIFEST), ("0.fits", SMALL_FITS), *more)
 
 
 def tarred(name: str, *, link: str = "", content: bytes = b"x", mode: str = "w") -> bytes:
@@ -180,7 +148,7 @@ def tarred(name: str, *, link: str = "", content: bytes = b"x", mode: str = "w")
     file = io.BytesIO()
     with tarfile.open(fileobj=file, mode=mode) as archive:  # type: ignore[call-overload]
         for one, of in (
-            ("transit.json", manifest()),
+            ("transit.json", MANIFEST),
             ("0.fits", SMALL_FITS),
             (name, b"" if link else content),
         ):
@@ -204,18 +172,12 @@ def lying_tar() -> bytes:
 
 ARCHIVES = [
     transit("a name that climbs, zip", 422, "archive-climbs", lambda: transit_zip(("../x.fits", b"x"))),
-    transit("an absolute name, zip", 422, "archive-climbs", lambda: transit_zip(("/etc/passwd", b"x"))),
-    transit("a name that climbs, tar", 422, "archive-climbs", lambda: tarred("../../x.fits")),
-    transit("an absolute name, tar", 422, "archive-climbs", lambda: tarred("/etc/cron.d/x")),
     transit("a symbolic link, tar", 422, "archive-not-plain", lambda: tarred("l.fits", link="/etc/passwd")),
     transit("a zip of 100 MB of zeros", 413, "archive-too-large", lambda: transit_zip(("b.fits", bytes(100 * MIB)))),
     transit("a tar.gz of 100 MB of zeros", 413, "archive-too-large", lambda: tarred("b.fits", content=bytes(100 * MIB), mode="w:gz")),
     transit("a member of 2^60 bytes", 413, "archive-too-large", lying_tar),
     transit("20000 members", 413, "archive-too-large", lambda: transit_zip(*((f"{n}.x", b"") for n in range(20_000)))),
-    transit("gzip of no tar", 415, "not-an-archive", lambda: gzip.compress(bytes(10 * MIB))),
-    transit("a transit.json that names a path", 422, "bad-manifest", lambda: transit_zip(known_psf="../../etc/passwd")),
     transit("a transit.json of lists in lists", 422, "bad-manifest", lambda: zipped(("transit.json", b"[" * DEEP))),
-    transit("a transit.json of 20 MB", 422, "bad-manifest", lambda: zipped(("transit.json", b" " * 20 * MIB))),
 ]  # fmt: skip
 
 
@@ -237,44 +199,29 @@ def form(
 REQUESTS = [
     body("no JSON", 422, "invalid-request", b"kind=deconvolve"),
     body("lists in lists", 400, "http-400", b"[" * DEEP),
-    body("objects in objects", 400, "http-400", b'{"kind":' * DEEP + b"1" + b"}" * DEEP),
     body("a number of 5000 digits", 400, "http-400", b'{"kind":' + b"9" * 5000 + b"}"),
     body("no UTF-8", 400, "http-400", b'{"kind":"\xff\xfe"}'),
     body("half a character", 422, "invalid-request", b'{"kind":"\\ud800","parameters":{}}'),
     body("NaN", 422, "invalid-request", b'{"kind":"deconvolve","parameters":{"image_id":"%s","saturation_dn":NaN}}' % A.encode()),
-    body("infinity", 422, "invalid-request", b'{"kind":"deconvolve","parameters":{"image_id":"%s","saturation_dn":1e999}}' % A.encode()),
     body("20 MB of JSON", 413, "too-large", b'"' + b"x" * 20 * MIB + b'"'),
     Attack("JSON that says it is text", 422, "invalid-request", content=lambda: b'{"kind":"psf-build"}', headers={"Content-Type": "text/plain"}),
-    body("null", 422, "invalid-request", b"null"),
-    job("no image", 422, "invalid-request", "deconvolve"),
-    job("no steps", 422, "invalid-request", "deconvolve", image_id=A, method={"steps": 0}),
-    job("steps that are a word", 422, "invalid-request", "deconvolve", image_id=A, method={"steps": "many"}),
     job("an unknown method", 422, "invalid-request", "deconvolve", image_id=A, method={"name": "x"}),
-    job("no instrument", 422, "invalid-request", "psf-build"),
     job("two instruments", 422, "invalid-request", "psf-build", instrument="hri_euv", instrument_file="x"),
-    job("an unknown component", 422, "invalid-request", "psf-build", instrument="hri_euv", component="x"),
-    job("an odd size", 422, "invalid-request", "psf-build", instrument="hri_euv", size=99),
     job("a mask that was not uploaded", 404, "no-such-image", "psf-build", instrument="hri_euv", mask_id=A),
     job("no TOML", 422, "bad-instrument-file", "psf-build", instrument_file="= = ="),
-    job("TOML that lacks keys", 422, "bad-instrument-file", "psf-build", instrument_file="name = 'x'"),
     job("a kind that is code", 422, "invalid-request", "__import__('os').system('true')"),
     job("a parameter more", 422, "invalid-request", "psf-build", instrument="hri_euv", callback="http://evil.example/"),
     job("an instrument that is a path", 422, "unknown-instrument", "psf-build", instrument="../../../etc/passwd"),
-    job("an instrument that is an address", 422, "unknown-instrument", "psf-build", instrument="http://169.254.169.254/"),
-    job("an instrument of NUL", 422, "invalid-request", "psf-build", instrument="hri_euv\0"),
     job("an image that is a path", 422, "invalid-request", "deconvolve", image_id="../" * 20 + "etc/passwd"),
     job("an image that was not uploaded", 404, "no-such-image", "deconvolve", image_id=A),
     job("a transit that was not uploaded", 404, "no-such-transit", "psf-fit", transit_id=A),
     job("steps without end", 422, "invalid-request", "deconvolve", image_id=A, method={"name": "linear", "steps": 10**9}),
-    job("a margin without end", 422, "invalid-request", "deconvolve", image_id=A, method={"name": "linear", "margin_px": 10**9}),
     job("draws without end", 422, "invalid-request", "deconvolve", image_id=A, error_draws=10**9),
-    job("a draw that shows no spread", 422, "invalid-request", "deconvolve", image_id=A, error_draws=1),
     job("a PSF without end", 422, "invalid-request", "psf-build", instrument="hri_euv", size=2**31),
     job("TOML: lists in lists", 422, "bad-instrument-file", "psf-build", instrument_file="a = " + "[" * DEEP),
     job("TOML: tables in tables", 422, "bad-instrument-file", "psf-build", instrument_file="a = " + "{b=" * DEEP),
     job("TOML: a key of 30000 parts", 422, "bad-instrument-file", "psf-build", instrument_file=".".join("a" * 30_000) + " = 1"),
     job("TOML: a number of 60000 digits", 422, "bad-instrument-file", "psf-build", instrument_file="a = " + "9" * 60_000),
-    body("TOML: half a character", 422, "invalid-request", b'{"kind":"psf-build","parameters":{"instrument_file":"\\ud800"}}'),
     job("TOML: more than fits", 422, "invalid-request", "psf-build", instrument_file="#" * 70_000),
     form("a form without boundary", b"--x\r\n", kind="multipart/form-data"),
     form("a form with a boundary of 5000", b"--x\r\n", kind="multipart/form-data; boundary=" + "x" * 5000),
@@ -284,45 +231,22 @@ REQUESTS = [
     form("a part with 200000 headers", b"--x\r\n" + b"A: b\r\n" * 200_000 + b"\r\n1\r\n--x--\r\n"),
     form("a form that breaks off", PART % b"file" + b"SIMPLE  =", code="upload-ended-early"),
     form("nothing as a form", b""),
-    form("a form of another boundary", b"no boundary here"),
-    form("a transit's form without a file", PART % b"other" + b"1\r\n--x--\r\n", to="transits"),
     form("a transit's form that breaks off", PART % b"file" + b"PK\3\4", code="upload-ended-early", to="transits"),
     got("an address of nothing", 404, "http-404", "/v1/nothing"),
     got("an id of 5 letters", 422, "invalid-request", "/v1/transits/short"),
-    got("a job that is not there", 404, "no-such-job", f"/v1/jobs/{A[:32]}"),
-    got("an image that is not there", 404, "no-such-image", f"/v1/images/{A}"),
-    got("a transit that is not there", 404, "no-such-transit", f"/v1/transits/{A}"),
-    got("a PSF that is not there", 404, "no-such-psf", f"/v1/psfs/{A}"),
-    got("a product that is not there", 404, "no-such-product", f"/v1/products/{A}"),
-    got("the file of a product that is not there", 404, "no-such-product", f"/v1/products/{A}/file"),
     got("an id that climbs", 404, "http-404", "/v1/images/..%2f..%2fetc%2fpasswd"),
     got("an id that climbs in a download", 404, "http-404", "/v1/products/..%2f..%2fcatalogue.sqlite/file"),
-    got("an id of NUL", 422, "invalid-request", "/v1/images/%00"),
     got("an id with a line end", 422, "invalid-request", "/v1/images/%0d%0aSet-Cookie:x=1"),
-    got("an id of 9000 letters", 422, "invalid-request", "/v1/images/" + "a" * 9000),
-    got("an id in capitals", 422, "invalid-request", "/v1/images/" + "A" * 64),
     got("a page of nothing", 422, "invalid-request", "/v1/jobs?limit=0"),
     got("a phase there is not", 422, "invalid-request", "/v1/jobs?phase=SLEEPING"),
     got("a cursor of nonsense", 422, "bad-cursor", "/v1/transits?cursor=nonsense"),
     got("a cursor of NUL", 422, "bad-cursor", "/v1/jobs?cursor=MS4wIAA="),
-    got("a cursor that is no number", 422, "bad-cursor", "/v1/psfs?cursor=bmFuIHg="),
-    Attack("an upload with a name of NUL", 422, "invalid-request", address="/v1/psfs?name=a%00b"),
-    got("a page without end", 422, "invalid-request", "/v1/jobs?limit=1000000"),
-    got("a cursor of ours it is not", 422, "bad-cursor", "/v1/jobs?cursor=%FF%01"),
-    got("a context of NUL", 422, "invalid-request", "/psfs?context=a%00b"),
-    Attack("a name of a file of NUL", 422, "invalid-request", address="/v1/images?filename=a%00b", content=lambda: SMALL_FITS),
-    body("NUL in JSON", 422, "invalid-request", b'{"files":[{"glob":"/a/*"}],"context":"a\\u0000b"}', address="/v1/bulk"),
-    body("half a character as a name", 422, "invalid-request", b'{"\xed\xa0\x80":1}'),
     Attack("a form with a codec of its own", 415, "bad-form", address="/login", headers={"Content-Type": FORM["Content-Type"] + "; charset=undefined"}, content=lambda: PART % b"key" + b"1\r\n--x--\r\n"),
     got("a name of control letters", 422, "invalid-request", "/v1/psfs?name=%1b%5b31m"),
     got("a host of another's", 421, "host-not-served", "/v1/jobs", Host="evil.example"),
     Attack("a page of another site", 403, "cross-site", address="/v1/jobs", headers={"Origin": "http://evil.example"}, content=lambda: b"{}"),
     Attack("a word that is no method", 405, "http-405", "BREW", "/v1/jobs"),
-    Attack("an upload to where there is none", 405, "http-405", "PUT", "/v1/images"),
     got("no key", 401, "no-key", "/v1/jobs", Authorization=""),
     got("a key of nonsense", 401, "bad-key", "/v1/jobs", Authorization="Bearer ' OR 1=1 --"),
     got("a key of a megabyte", 401, "bad-key", "/v1/jobs", Authorization="Bearer hpsf_" + "a" * MIB),
-    got("a password that is no base64", 401, "bad-key", "/v1/jobs", Authorization="Basic %%%"),
-    got("another's name", 403, "scope-missing", "/v1/jobs", X_Owner="bob"),
-    got("the metrics", 403, "scope-missing", "/metrics"),
 ]  # fmt: skip

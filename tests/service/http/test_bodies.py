@@ -1,31 +1,39 @@
-"""Bodies: the key comes first, then sizes, and how many values JSON may have."""
+"""Bodies: the key comes first, then sizes, and how many values JSON may have.
+Sockets and connections: how the server listens, and how many files it may open."""
 
 from __future__ import annotations
 
+import asyncio
+import gc
 import json
 import re
+import resource
 import select
+import signal
 import socket
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
+import uvicorn
 from fastapi.testclient import TestClient
 
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.header import HeaderSummary
+from service import server
 from service.app import create_app
 from service.http import files as http_files
 from tests.conftest import write_image
 from tests.service.conftest import refusal, settings_in
 from tests.service.keyed import Keyed, bearer, keyed
-from tests.service.serving import serving
+from tests.service.serving import in_own_loop, serving
 from tests.whole.stack import wait_for
 from workers.catalogue.access import Scope
 from workers.settings import Settings
@@ -127,11 +135,11 @@ def test_only_a_bulk_run_may_be_large(settings: Settings) -> None:
 def test_a_body_of_lists_without_end_is_counted_before_it_is_parsed(
     shared_service: Keyed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    lengths: list[int] = []
-    loads = json.loads
+    parsed: list[tuple[int, str]] = []
+    loads, good = json.loads, b'{"kind": "x"}'
 
     def parse(content: Any, **options: Any) -> Any:
-        lengths.append(len(content))
+        parsed.append((len(content), threading.current_thread().name if content == good else ""))
         return loads(content, **options)
 
     ann = shared_service.client("ann")
@@ -139,26 +147,13 @@ def test_a_body_of_lists_without_end_is_counted_before_it_is_parsed(
     answers = [
         ann.post("/v1/bulk", content=b"[" + unit * 2**18, headers=JSON) for unit in (b"[],", b"{},", b'"":0,')
     ]
+    small = ann.post("/v1/jobs", content=good, headers=JSON)
     monkeypatch.undo()
     for answer in answers:
         refusal(answer, 413, "too-many-values")
-    assert all(length < 1000 for length in lengths)
-
-
-def test_json_is_parsed_off_the_event_loop(shared_service: Keyed, monkeypatch: pytest.MonkeyPatch) -> None:
-    threads: list[str] = []
-    loads, body = json.loads, b'{"kind": "x"}'
-
-    def parse(content: Any, **options: Any) -> Any:
-        if content == body:  # also the database parses JSON
-            threads.append(threading.current_thread().name)
-        return loads(content, **options)
-
-    monkeypatch.setattr("service.http.guard.json.loads", parse)
-    answer = shared_service.client("ann").post("/v1/jobs", content=body, headers=JSON)
-    monkeypatch.undo()
-    assert answer.status_code == 422
-    assert len(threads) == 1 and "worker" in threads[0].lower(), threads
+    assert all(length < 1000 for length, _ in parsed)
+    (thread,) = [name for _, name in parsed if name]
+    assert small.status_code == 422 and "worker" in thread.lower(), "off the event loop"
 
 
 def test_many_wrong_values_get_a_short_answer(shared_service: Keyed) -> None:
@@ -171,13 +166,10 @@ def test_many_wrong_values_get_a_short_answer(shared_service: Keyed) -> None:
     assert len(names.json()["errors"]) == 20
 
 
-@pytest.mark.parametrize("declared", [10, 10**9])
-def test_a_body_that_nobody_reads_breaks_no_stream(
-    live: Live, caplog: pytest.LogCaptureFixture, declared: int
-) -> None:
+def test_a_body_that_nobody_reads_breaks_no_stream(live: Live, caplog: pytest.LogCaptureFixture) -> None:
     """A stream of events waits for the end of the connection; a body that is late or long is none."""
-    job, _ = live.service.catalogue.jobs.submit("psf-build", {}, f"k{declared}", "ann")
-    headers = {"Content-Length": str(declared)} | bearer(live.service.key("ann"))
+    job, _ = live.service.catalogue.jobs.submit("psf-build", {}, "k", "ann")
+    headers = {"Content-Length": str(10**9)} | bearer(live.service.key("ann"))
     with (
         live.begin("GET", f"/v1/jobs/{job.id}/events", headers) as connection,
         connection.makefile("rb") as file,
@@ -257,3 +249,84 @@ def test_inspections_of_uploads_do_not_use_the_threads_of_other_requests(
         finally:
             let_end.set()
         assert {one.result().status_code for one in sent} <= {200, 201}
+
+
+# --- sockets and connections -----------------------------------------------------------------------------
+
+
+def test_answers_on_a_connection_that_is_used_again_do_not_wait_for_an_acknowledgement() -> None:
+    """Whether asyncio sets TCP_NODELAY depends on the protocol that the listener states."""
+
+    async def delay_is_off() -> bool:
+        accepted: asyncio.Future[bool] = asyncio.get_running_loop().create_future()
+
+        def look(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            own: socket.socket = writer.get_extra_info("socket")
+            accepted.set_result(bool(own.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)))
+            writer.close()
+
+        with server.listening("127.0.0.1", 0) as listener:
+            async with await asyncio.start_server(look, sock=listener):
+                _, client = await asyncio.open_connection(*listener.getsockname()[:2])
+                off = await asyncio.wait_for(accepted, 10)
+                client.close()
+        return off
+
+    assert in_own_loop(delay_is_off)
+
+
+def test_a_port_that_is_in_use_is_refused() -> None:
+    with server.listening("127.0.0.1", 0) as listener:
+        listener.listen()
+        with pytest.raises(OSError, match="in use"):
+            server.listening("127.0.0.1", listener.getsockname()[1])
+
+
+@pytest.fixture
+def unfrozen() -> Iterator[None]:
+    """Nothing is kept from the garbage collector, now and afterwards; signals are handled afterwards as before."""
+    handler = signal.getsignal(signal.SIGTERM)
+    gc.unfreeze()
+    yield
+    gc.unfreeze()
+    signal.signal(signal.SIGTERM, handler)
+
+
+@pytest.mark.usefixtures("unfrozen")
+def test_a_started_server_keeps_idle_connections_and_spares_the_garbage_collector(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An idle connection stays open longer than clients use it; what the start has loaded is not looked at again."""
+    servers: list[uvicorn.Server] = []
+    run = uvicorn.Server.run
+
+    def run_and_stop(running: uvicorn.Server, sockets: list[socket.socket]) -> None:
+        servers.append(running)
+        thread = threading.Thread(target=run, args=(running, sockets))
+        thread.start()
+        wait_for(lambda: running.started and gc.get_freeze_count() > 0, "the server listens", timeout_s=20)
+        running.should_exit = True
+        thread.join(20)
+
+    monkeypatch.setattr(uvicorn.Server, "run", run_and_stop)
+    monkeypatch.setattr(server, "embedded_worker", lambda settings: nullcontext())
+    monkeypatch.setattr(server.logs, "configure", lambda settings, *, verbose: None)
+    server.serve(settings_in(tmp_path), "127.0.0.1", 0, lambda address: None)
+    used_for_s = httpx.Limits().keepalive_expiry
+    assert used_for_s is not None and servers[0].config.timeout_keep_alive > 2 * used_for_s
+
+
+def test_a_server_may_open_as_many_files_as_the_system_allows(monkeypatch: pytest.MonkeyPatch) -> None:
+    infinity, most = resource.RLIM_INFINITY, server.MOST_OPEN_FILES
+    for soft, hard, raised in (
+        (1024, 10_000, 10_000),
+        (1024, infinity, most),
+        (1024, 1024, None),
+        (infinity, infinity, None),
+    ):
+        limits: list[tuple[int, int]] = []
+        with monkeypatch.context() as patched:
+            patched.setattr(resource, "getrlimit", lambda _what, both=(soft, hard): both)
+            patched.setattr(resource, "setrlimit", lambda _what, both, limits=limits: limits.append(both))
+            server._allow_open_files()
+        assert limits == ([] if raised is None else [(raised, hard)]), (soft, hard)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
@@ -62,19 +63,11 @@ SITES: list[tuple[dict[str, str], bool]] = [
     ({"Sec-Fetch-Site": "none"}, False),
     ({"Origin": "http://evil.example"}, True),
     ({"Origin": "http://testserver:81"}, True),
-    ({"Origin": "null"}, True),
     ({"Origin": "http://["}, True),
     ({"Sec-Fetch-Site": "cross-site"}, True),
     ({"Sec-Fetch-Site": "same-site", "Origin": "http://testserver"}, True),
 ]
-CHANGES = (
-    ("POST", "/uws/jobs"),
-    ("POST", "/uws/jobs/x/phase"),
-    ("DELETE", "/uws/jobs/x"),
-    ("POST", "/v1/jobs"),
-    ("POST", "/v1/images"),
-    ("DELETE", "/v1/jobs/x"),
-)
+CHANGES = (("POST", "/uws/jobs"), ("DELETE", "/uws/jobs/x"), ("POST", "/v1/images"), ("DELETE", "/v1/jobs/x"))
 
 
 def test_a_page_of_another_site_changes_nothing(shared_api: TestClient, shared_service: Keyed) -> None:
@@ -111,6 +104,22 @@ def test_the_files_of_pages_are_served_under_any_name(shared_api: TestClient) ->
     there = assets.address("heliopsf.css")
     assert shared_api.get(there, headers={"Host": "evil.example"}).status_code == 200
     assert shared_api.post(there, headers={"Host": "evil.example"}).status_code == 421
+
+
+def test_a_text_that_no_database_holds_is_refused_wherever_it_stands(shared_api: TestClient) -> None:
+    """NUL and halves of surrogate pairs: in addresses, queries, names and values of JSON, and fields of forms."""
+    requests: tuple[tuple[str, str, dict[str, Any]], ...] = (
+        ("GET", "/v1/images/a%00b", {}),
+        ("GET", "/v1/psfs?name=a%00b", {}),
+        ("GET", "/psfs?context=a%00b", {}),
+        ("POST", "/v1/psfs?name=a%00b", {"content": b"SIMPLE  ="}),
+        ("POST", "/v1/bulk", {"content": rb'{"files": [{"glob": "/a/*"}], "context": "a\u0000b"}'}),
+        ("POST", "/v1/jobs", {"content": rb'{"kind": "psf-build", "parameters": {"a\ud800": 1}}'}),
+        ("POST", "/bulk/start", {"data": {"name": "a\0b"}}),
+    )
+    for method, address, sent in requests:
+        headers = {"Content-Type": "application/json"} if "/v1/" in address and "content" in sent else {}
+        refusal(shared_api.request(method, address, headers=headers, **sent), 422, "invalid-request")
 
 
 # Rates ----------------------------------------------------------------------------------------------
@@ -191,15 +200,7 @@ def test_every_answer_tells_the_browser_what_it_may_do(
 ) -> None:
     ann = shared_service.client("ann")
     upload(ann, image_file)
-    for address in (
-        "/v1/images",
-        "/v1/images?limit=0",
-        "/nowhere",
-        "/uws/jobs",
-        "/healthz",
-        "/docs",
-        "/v1/jobs/" + 32 * "0",
-    ):
+    for address in ("/v1/images", "/v1/images?limit=0", "/nowhere", "/uws/jobs", "/healthz", "/docs"):
         headers = ann.get(address).headers
         assert headers["X-Content-Type-Options"] == "nosniff"
         assert headers["Referrer-Policy"] == "no-referrer"

@@ -121,21 +121,6 @@ def test_rows_over_their_number_are_refused_and_add_nothing(
     assert api.post(f"/v1/psfs/{psf_id}/status", json=wrong).status_code == 200, "whatever the quota"
 
 
-def test_work_is_refused_where_nothing_of_its_result_could_be_kept(
-    api: TestClient, catalogue: Catalogue, image_file: Path, psf_file: Path
-) -> None:
-    image_id, psf_id = upload(api, image_file), upload(api, psf_file, "/v1/psfs")
-    fill(catalogue, left_bytes=0)
-    parameters = {"image_id": image_id, "psf_id": psf_id}
-    for where, body in (
-        ("/v1/jobs", {"kind": "deconvolve", "parameters": parameters}),
-        ("/v1/bulk", {"images": [image_id], "psf_id": psf_id}),
-    ):
-        answer = api.post(where, json=body)
-        assert "of 1.0 MiB are used" in refusal(answer, 507, "quota-exceeded")
-        assert (answer.json()["used_bytes"], answer.json()["limit_bytes"]) == (2**20, 2**20)
-
-
 def test_a_listing_that_fills_the_quota_stops_and_goes_on_with_room(
     api: TestClient,
     catalogue: Catalogue,
@@ -196,6 +181,8 @@ def test_jobs_that_were_queued_while_there_was_room_end_where_there_is_none(
     assert jobs[first]["phase"] == jobs[equal]["phase"] == "COMPLETED"
     assert jobs[equal]["result"] == jobs[first]["result"], "nothing more"
     assert jobs[tables]["phase"] == "COMPLETED", "tables are not counted"
+    refused = api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": parameters(3)})
+    assert "of 1.0 MiB are used" in refusal(refused, 507, "quota-exceeded"), "its result could not be kept"
 
 
 def test_a_bulk_that_fills_the_quota_stops_and_goes_on_with_room(

@@ -1,49 +1,30 @@
-"""The pages of bulk runs, by plain forms: start, progress, results, reasons of failures, and whose they are."""
+"""The pages of bulk runs, by plain forms: start, progress, results, reasons of failures, and whose they are.
+The form of a bulk run of files in a folder, by plain forms: the check before the start, the layout, and errors."""
 
 from __future__ import annotations
 
 import os
 import re
 from collections.abc import Callable, Iterator
+from html import unescape
+from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
 from fastapi.testclient import TestClient
 
 from service.app import create_app
+from service.pages import bulk
 from service.pages import bulk as bulk_pages
 from tests.conftest import write_image, write_psf
 from tests.service.conftest import upload, work_through_bulks
 from tests.service.keyed import keyed
 from workers.catalogue.access import Scope
+from workers.contract.bulk import FIELDS
 from workers.settings import Settings
 
 FEW = {"method": {"name": "richardson-lucy", "steps": 2}}
 HOSTILE = "<script>alert(1)</script>.fits"
-
-
-@pytest.fixture
-def settings(settings: Settings, tmp_path: Path) -> Settings:
-    (tmp_path / "archive").mkdir()
-    return settings.model_copy(update={"bulk_roots": str(tmp_path / "archive")})
-
-
-@pytest.fixture
-def api(settings: Settings) -> Iterator[TestClient]:
-    with TestClient(create_app(settings), raise_server_exceptions=False) as client:
-        client.headers["Accept"] = "text/html"
-        yield client
-
-
-@pytest.fixture
-def psf_id(api: TestClient, psf_file: Path) -> str:
-    return upload(api, psf_file, "/v1/psfs")
-
-
-@pytest.fixture
-def work(settings: Settings, api: TestClient) -> Callable[[], None]:
-    """Runs turns until no bulk run is at work."""
-    return lambda: work_through_bulks(settings)
 
 
 def uploaded(api: TestClient, folder: Path, count: int, first: int = 0) -> list[str]:
@@ -92,31 +73,27 @@ def test_a_run_of_all_images_without_a_product_is_started_followed_and_shown(
     assert second["images"]["total"] == 1 and newest not in first
 
 
-def test_a_run_from_the_form_uses_its_method_and_steps(api: TestClient, psf_id: str, tmp_path: Path) -> None:
-    uploaded(api, tmp_path, 1)
+def test_a_run_from_the_form_uses_its_method_and_steps_for_a_limited_number_of_images(
+    api: TestClient, psf_id: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    uploaded(api, tmp_path, 2)
     page = api.get("/bulk").text
     usual = dict(re.findall(r'<option value="([a-z-]+)">\1, usually (\d+) steps</option>', page))
     assert next(iter(usual)) == "richardson-lucy" and usual["linear"] == "5" and 'max="200"' in page
-    for number, (fields, expected) in enumerate(
-        (
-            ({}, {"name": "richardson-lucy", "steps": 20}),
-            ({"method": "linear", "steps": ""}, {"name": "linear", "steps": 5}),
-            ({"method": "basic-iterative", "steps": "7"}, {"name": "basic-iterative", "steps": 7}),
-        )
-    ):
+    monkeypatch.setattr(bulk_pages, "MOST_STARTED", 1)
+    assert "the newest 1 of your images that have no product" in api.get("/bulk").text
+    forms = (
+        ({}, {"name": "richardson-lucy", "steps": 20}),
+        ({"method": "linear", "steps": ""}, {"name": "linear", "steps": 5}),
+        ({"method": "basic-iterative", "steps": "7"}, {"name": "basic-iterative", "steps": 7}),
+    )
+    for number, (fields, expected) in enumerate(forms):
         place = started(api, psf_id, name=str(number), **fields)
-        method = api.get(f"/v1{place}").json()["request"]["parameters"]["method"]
+        run = api.get(f"/v1{place}").json()
+        assert run["images"]["total"] == 1
+        method = run["request"]["parameters"]["method"]
         assert {key: method[key] for key in expected} == expected
         assert f"<dd>{expected['name']}, {expected['steps']} steps</dd>" in api.get(place).text
-
-
-def test_a_run_from_the_form_takes_a_limited_number_of_images(
-    api: TestClient, psf_id: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(bulk_pages, "MOST_STARTED", 2)
-    uploaded(api, tmp_path, 3)
-    assert "the newest 2 of your images that have no product" in api.get("/bulk").text
-    assert api.get(f"/v1{started(api, psf_id)}").json()["images"]["total"] == 2
 
 
 def test_results_are_paged_worst_first_and_in_the_order_of_the_run(
@@ -141,22 +118,11 @@ def test_results_are_paged_worst_first_and_in_the_order_of_the_run(
     assert api.get(f"/bulk/{made['id']}?cursor=MTIz").status_code == 422
 
 
-def test_a_deleted_product_is_named_and_not_linked(
-    api: TestClient, psf_id: str, work: Callable[[], None], tmp_path: Path
-) -> None:
-    uploaded(api, tmp_path, 1)
-    place = started(api, psf_id)
-    work()
-    (product,) = re.findall(r'href="/products/(\w+)"', api.get(place).text)
-    assert api.delete(f"/v1/products/{product}").status_code == 204
-    page = api.get(place).text
-    assert product not in page and "product deleted" in page
-
-
 def test_failures_are_grouped_by_reason_with_an_example(
     api: TestClient, psf_id: str, work: Callable[[], None], tmp_path: Path
 ) -> None:
-    archive = tmp_path / "archive"
+    archive = tmp_path / "archive" / "mixed"
+    archive.mkdir()
     write_image(archive / "good.fits")
     (archive / HOSTILE.replace("/", "-")).write_text("Dear archive,\n" * 300)
     (archive / "zz.fits").write_text("Dear reader,\n" * 300)
@@ -206,45 +172,38 @@ def test_a_run_is_deleted_by_its_button(
 ) -> None:
     uploaded(api, tmp_path, 1)
     place = started(api, psf_id, name="quiet Sun")
-    refused = api.post(f"{place}/delete")
-    assert (
-        refused.status_code == 409 and "this bulk run is in phase RUNNING: cancel it first." in refused.text
-    )
+    assert api.post(f"{place}/delete").status_code == 409
     work()
     page = api.get(place).text
     assert "The products stay." in page
     (product,) = re.findall(r'href="/products/(\w+)"', page)
+    assert api.delete(f"/v1/products/{product}").status_code == 204
+    page = api.get(place).text
+    assert product not in page and "product deleted" in page
     answer = api.post(f"{place}/delete", follow_redirects=False)
     assert (answer.status_code, answer.headers["location"]) == (303, "/bulk")
     assert "quiet Sun" not in api.get("/bulk").text and "No run yet." in api.get("/bulk").text
-    assert api.get(f"/products/{product}").status_code == 200
     gone = api.get(place)
     assert gone.status_code == api.post(f"{place}/delete").status_code == 404
     assert "There is no such bulk run here. It was deleted" in gone.text
 
 
-def test_a_wrong_form_says_what_was_expected(
-    subtests: pytest.Subtests, api: TestClient, tmp_path: Path
-) -> None:
+def test_a_wrong_form_says_what_was_expected(api: TestClient, tmp_path: Path) -> None:
     uploaded(api, tmp_path, 1)
+    unknown = {"choice": f"psf:{'0' * 64}"}
     for fields, told in (
         ({}, "choose one"),
         ({"choice": "psf:abc"}, "PSF: "),
-        ({"choice": f"psf:{'0' * 64}"}, "There is no such PSF here"),
+        (unknown, "There is no such PSF here"),
         ({"choice": "context:none"}, "none"),
-        ({"choice": f"psf:{'0' * 64}", "name": "two\nlines"}, "Name: "),
-        ({"choice": f"psf:{'0' * 64}", "steps": "many"}, "Steps: Input should be a valid integer"),
-        ({"choice": f"psf:{'0' * 64}", "steps": "201"}, "Steps: Input should be less than or equal to 200"),
-        (
-            {"choice": f"psf:{'0' * 64}", "method": "magic"},
-            "Method: expected name to be one of richardson-lucy",
-        ),
+        (unknown | {"name": "two\nlines"}, "Name: "),
+        (unknown | {"steps": "201"}, "Steps: Input should be less than or equal to 200"),
+        (unknown | {"method": "magic"}, "Method: expected name to be one of richardson-lucy"),
     ):
-        with subtests.test(str((fields, told))):
-            refused = api.post("/bulk/start", data=fields)
-            assert refused.status_code in (404, 409, 422) and told in refused.text
-            assert refused.headers["Content-Type"].startswith("text/html")
-            assert api.get("/v1/bulk").json()["items"] == []
+        refused = api.post("/bulk/start", data=fields)
+        assert refused.status_code in (404, 409, 422) and told in refused.text, fields
+        assert refused.headers["Content-Type"].startswith("text/html")
+    assert api.get("/v1/bulk").json()["items"] == []
 
 
 def test_nobody_sees_or_changes_the_run_of_another_owner(settings: Settings, tmp_path: Path) -> None:
@@ -264,3 +223,214 @@ def test_nobody_sees_or_changes_the_run_of_another_owner(settings: Settings, tmp
             assert bob.post(f"{place}/{change}").status_code == 404
             assert reader.post(f"{place}/{change}").status_code == 403
         assert ann.get(f"/v1{place}").json()["phase"] == "RUNNING"
+
+
+# --- files in a folder -----------------------------------------------------------------------------------
+
+
+LAYOUT = "{telescop}/{date:%Y/%m/%d}/{stem}_sharp.fits"
+
+
+@pytest.fixture
+def archive(tmp_path: Path) -> Path:
+    """Two images, and a file that is none."""
+    root = tmp_path / "archive"
+    root.mkdir()
+    for number in range(2):
+        write_image(root / f"{number}.fits", seed=number, **{"DATE-BEG": "2021-03-01T12:00:00"})
+    (root / "letter.fits").write_text("Dear archive,\n" * 300)
+    return root
+
+
+@pytest.fixture
+def settings(settings: Settings, archive: Path, tmp_path: Path) -> Settings:
+    out = tmp_path / "out"
+    out.mkdir()
+    return settings.model_copy(update={"bulk_roots": str(archive), "bulk_output_roots": str(out)})
+
+
+@pytest.fixture
+def api(settings: Settings) -> Iterator[TestClient]:
+    with TestClient(create_app(settings), raise_server_exceptions=False) as client:
+        client.headers["Accept"] = "text/html"
+        yield client
+
+
+@pytest.fixture
+def form(api: TestClient, archive: Path, tmp_path: Path, psf_file: Path) -> dict[str, str]:
+    """A form that is filled in."""
+    psf_id = upload(api, psf_file, "/v1/psfs")
+    return {
+        "pattern": f"{archive}/*.fits", "choice": f"psf:{psf_id}", "name": "Rome", "method": "richardson-lucy",
+        "steps": "2", "folder": str(tmp_path / "out"), "only": "1", "layout": LAYOUT,
+    }  # fmt: skip
+
+
+class _Fields(HTMLParser):
+    """The fields of the forms of a page: which have labels, and what describes them."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.labels = 0
+        self.unlabelled: list[str] = []
+        self.described: list[str] = []
+        self.ids: list[str] = []
+        self.values: dict[str, str] = {}
+        self.hidden: dict[str, str] = {}
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        given = {name: value or "" for name, value in attributes}
+        self.labels += tag == "label"
+        self.ids += [given["id"]] if "id" in given else []
+        self.described += given.get("aria-describedby", "").split()
+        if tag not in ("input", "select", "textarea"):
+            return
+        if given.get("type") == "hidden":
+            self.hidden[given["name"]] = given["value"]
+            return
+        self.values[given["name"]] = given.get("value", "")
+        if not self.labels:
+            self.unlabelled.append(given["name"])
+
+    def handle_endtag(self, tag: str) -> None:
+        self.labels -= tag == "label"
+
+
+def fact(page: str, name: str) -> str:
+    """The value of a fact of a page, without markup."""
+    found = re.search(rf"<dt>{name}</dt><dd>(.*?)</dd>", page)
+    assert found is not None, name
+    return unescape(re.sub("<.*?>", "", found[1]))
+
+
+def runs(api: TestClient) -> list[dict[str, object]]:
+    return list(api.get("/v1/bulk").json()["items"])
+
+
+def test_the_form_names_the_folders_and_the_fields_of_a_layout(
+    api: TestClient, form: dict[str, str], archive: Path, tmp_path: Path
+) -> None:
+    page = api.get("/bulk").text
+    fields = _Fields(page)
+    assert fields.unlabelled == [] and set(fields.described) <= set(fields.ids)
+    assert len(set(fields.ids)) == len(fields.ids)
+    assert set(form) <= set(fields.values)
+    assert f"<code>{archive}</code>" in page and f"<code>{tmp_path / 'out'}</code>" in page
+    assert all(f"<code>{{{name}}}</code>" in page for name in FIELDS)
+
+
+def test_a_check_says_what_the_run_then_does(
+    api: TestClient, form: dict[str, str], settings: Settings, tmp_path: Path
+) -> None:
+    page = api.post("/bulk/check", data=form).text
+    assert runs(api) == [] and list((tmp_path / "out").iterdir()) == [], "nothing was started or written"
+    estimate = {
+        "files": [{"glob": form["pattern"]}], "psf_id": form["choice"][4:],
+        "parameters": {"method": {"name": "richardson-lucy", "steps": 2}},
+        "output": {"folder": form["folder"], "only": True, "layout": LAYOUT},
+    }  # fmt: skip
+    expected = api.post("/v1/bulk/estimate", json=estimate).json()
+    assert fact(page, "Images") == "3" == str(expected["images"])
+    assert expected["complete"] and 'class="good"' in page
+    assert fact(page, "Examined") == "3 of 3 images; 1 would be refused"
+    assert fact(page, "Memory").startswith(f"at most {expected['memory_mib']} MiB")
+    assert fact(page, "Time").endswith("with 1 worker process")
+    example = fact(page, "Output").removeprefix("for example ")
+    assert example == expected["example_output"]
+    assert re.fullmatch(rf"{tmp_path}/out/[\w-]+/2021/03/01/[01]_sharp\.fits", example)
+    refused = re.search(r'<td class="id name">(.*?)</td><td class="name">(.*?)</td>', page)
+    assert refused is not None and refused[1].endswith("letter.fits") and "not a FITS file" in refused[2]
+
+    started = api.post("/bulk/files", data=_Fields(page).hidden, follow_redirects=False)
+    assert started.status_code == 303
+    run = api.get(f"/v1{started.headers['location']}").json()
+    assert run["request"]["output"] == estimate["output"] and run["name"] == "Rome"
+    page = api.get(started.headers["location"]).text
+    said = {
+        "Files": form["pattern"],
+        "Method": "richardson-lucy, 2 steps",
+        "Output": f"{form['folder']} only",
+        "Names": LAYOUT,
+    }
+    assert {name: fact(page, name).strip() for name in said} == said
+    assert fact(page, "PSF").startswith("uploaded 0.0.0")
+    work_through_bulks(settings)
+    done = api.get(f"/v1{started.headers['location']}").json()["images"]
+    assert (done["total"], done["done"], done["failed"]) == (3, 2, 1)
+    assert Path(example).is_file(), "the product is where the check said"
+
+
+def test_a_wrong_form_is_shown_again_with_the_reason(
+    api: TestClient, form: dict[str, str], archive: Path
+) -> None:
+    for wrong, told in (
+        ({"pattern": ""}, "Expected a pattern that names files"),
+        ({"pattern": "/etc/*.fits"}, "Expected a path below"),
+        ({"pattern": "{archive}/*.none"}, "found no files"),
+        ({"layout": "{nothing}.fits"}, "Names of the files: expected the fields stem"),
+        ({"folder": ""}, "Expected an output folder, because"),
+        ({"folder": "/etc"}, "Expected an output folder below"),
+        ({"choice": "nothing"}, "Expected a PSF or a context"),
+        ({"steps": "many"}, "Steps"),
+        ({"name": "<script>alert(1)</script>" * 9}, "Name: "),
+    ):
+        wrong = {name: value.replace("{archive}", str(archive)) for name, value in wrong.items()}
+        place = "/bulk/files" if "layout" in wrong else "/bulk/check"  # a start is refused as a check is
+        answer = api.post(place, data=form | wrong)
+        assert answer.status_code in (404, 422), answer.text
+        alert = re.search(r'<div class="error" role="alert">(.*?)</div>', answer.text)
+        assert alert is not None and told in unescape(alert[1]), answer.text
+        values = _Fields(answer.text).values
+        for name in ("pattern", "name", "folder", "layout"):
+            assert values[name] == (form | wrong)[name], "nobody has to write it again"
+        assert "<script>alert" not in answer.text
+    assert runs(api) == []
+
+
+def test_without_output_or_folders_the_page_says_what_is_missing(
+    api: TestClient, form: dict[str, str], settings: Settings
+) -> None:
+    plain = form | {"folder": "", "only": "", "layout": ""}
+    hidden = _Fields(api.post("/bulk/check", data=plain).text).hidden
+    assert not {"folder", "only", "layout"} & set(hidden)
+    place = api.post("/bulk/files", data=hidden, follow_redirects=False).headers["location"]
+    assert api.get(f"/v1{place}").json()["request"]["output"] is None
+    no_output, nothing = {"bulk_output_roots": ""}, {"bulk_output_roots": "", "bulk_roots": ""}
+    for roots in (no_output, nothing):
+        changed = create_app(settings.model_copy(update=roots))
+        with TestClient(changed, headers={"Accept": "text/html"}) as without:
+            page = without.get("/bulk").text
+            fields = set(_Fields(page).values)
+            assert ("pattern" in fields) == (roots is no_output) and not {"folder", "layout"} & fields
+            assert ("HELIOPSF_BULK_ROOTS" in page) == (roots is nothing)
+            refused = without.post("/bulk/check", data=form)
+            assert refused.status_code == 422 and "HELIOPSF_BULK_" in refused.text
+
+
+def test_many_refused_images_are_counted_and_some_are_shown(
+    api: TestClient, form: dict[str, str], archive: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bulk, "MOST_REFUSED", 2)
+    for number in range(3):
+        (archive / f"<b>{number}.fits").write_text("Dear reader,\n" * 300)
+    page = api.post("/bulk/check", data=form).text
+    assert "The first 2 of 4." in page and page.count('<td class="id name">') == 2
+    assert "<b>" not in page and "/&lt;b&gt;0.fits" in page
+
+
+def test_a_check_that_comes_to_no_end_says_so(
+    api: TestClient, form: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("workers.bulk.dry_run.BUDGET_S", -1.0)
+    page = api.post("/bulk/check", data=form).text
+    assert fact(page, "Images") == "at least 0" and "The run may be larger." in page
+
+
+def test_a_key_without_the_scope_bulk_neither_checks_nor_starts(settings: Settings, psf_file: Path) -> None:
+    with keyed(settings) as service:
+        reader = service.client("ann", Scope.READ, Scope.SUBMIT)
+        reader.headers["Accept"] = "text/html"
+        assert 'name="pattern"' not in reader.get("/bulk").text
+        for place in ("/bulk/check", "/bulk/files"):
+            assert reader.post(place, data={"pattern": "/x"}).status_code == 403

@@ -9,16 +9,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import pytest
 from fastapi.testclient import TestClient
-from sqlalchemy import create_engine, select, update
+from sqlalchemy import update
 
 from service.pages.forms import address_of
 from service.pages.sentences import of_error, plain
 from tests.conftest import write_image, write_psf
-from tests.service.conftest import upload
+from tests.service.conftest import execute, result_of, upload
+from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ProductRow
-from workers.settings import Settings
 
 PERSON = {"Accept": "text/html,application/xhtml+xml,*/*;q=0.8"}
 AIA = {"TELESCOP": "SDO/AIA", "INSTRUME": "AIA_3", "WAVELNTH": 1600, "CDELT1": 0.6, "CDELT2": 0.6}
@@ -55,10 +54,8 @@ def checked(api: TestClient, image_id: str, **options: str) -> list[str]:
 
 def test_an_image_without_a_psf_is_told_so(api: TestClient, tmp_path: Path) -> None:
     xrt = image(api, tmp_path, **XRT)
-    assert checked(api, xrt) == [
-        "No PSF for Hinode/XRT is known here. heliopsf has no instrument file for it: an instrument file describes pupils "
-        "and meshes, but not mirrors that reflect X-rays at grazing incidence. Upload a PSF here, or fit one to a transit."
-    ]
+    (line,) = checked(api, xrt)
+    assert line.startswith("No PSF for Hinode/XRT is known here.") and "Upload a PSF here" in line
     page = api.get(f"/images/{xrt}").text
     assert "none: choose a PSF" in page and "chosen for this image" not in page
     assert "2012-06-05T22:00:00.123" in page
@@ -70,22 +67,16 @@ def test_the_psf_of_another_channel_is_refused_before_a_job(
 ) -> None:
     aia = image(api, tmp_path, **{**AIA, "WAVELNTH": 193})
     psf = api.post("/v1/psfs?instrument=aia_171&channel=171", content=psf_file.read_bytes()).json()["id"]
-    assert checked(api, aia, psf_id=psf) == [
-        "PSF uploaded is not made for this image: the image is of aia_193, the PSF of aia_171; the image is of 193 angstrom, "
-        "the PSF of 171 angstrom. Choose another PSF.",
-        "If you are sure, allow it below.",
-    ]
+    first, last = checked(api, aia, psf_id=psf)
+    assert "the image is of aia_193, the PSF of aia_171" in first and "allow it below" in last
     assert checked(api, aia, psf_id=psf, other_channel="1")[0].endswith("You chose this PSF.")
 
 
 def test_the_advice_is_that_of_the_error(api: TestClient, psf_file: Path, tmp_path: Path) -> None:
     product = image(api, tmp_path, PSFID="0" * 64)
     psf = upload(api, psf_file, "/v1/psfs")
-    assert checked(api, product, psf_id=psf) == [
-        "This file is a product of heliopsf: it was deconvolved before (its header has the card PSFID). Use the original "
-        "image.",
-        "If you are sure, allow it below.",
-    ]
+    first, last = checked(api, product, psf_id=psf)
+    assert "the card PSFID" in first and "allow it below" in last
     page = api.get(f"/images/{product}?psf_id={psf}").text
     assert "What you can do" not in page and "Upload a PSF" not in page
 
@@ -104,14 +95,6 @@ def test_an_error_plane_needs_no_figures_and_the_form_takes_them(api: TestClient
     assert checked(api, hri, error_draws="1") == [
         "Noise realisations: expected 0, or 2 or more; got 1: the spread cannot be estimated from one realisation."
     ]
-
-
-def test_a_short_time_is_told_as_a_sentence(api: TestClient, psf_file: Path, tmp_path: Path) -> None:
-    found = checked(api, image(api, tmp_path), psf_id=upload(api, psf_file, "/v1/psfs"), steps="1")
-    assert re.fullmatch(r"(Less than 1 s|About \d+ s) and \d+ MiB\.", found[2])
-    assert re.match(r"PSF uploaded 0\.0\.0\+\w{8} \(draft\)\.", found[0]) and found[1].startswith(
-        "Draft means"
-    )
 
 
 # What is kept ---------------------------------------------------------------------------------------
@@ -152,19 +135,6 @@ def test_a_psf_that_the_service_chose_is_chosen_again() -> None:
     assert "psf_id=2222" in address_of(made)
 
 
-def test_products_of_an_image_are_told_apart(
-    api: TestClient, psf_file: Path, tmp_path: Path, run_jobs: Callable[[], None]
-) -> None:
-    psf, sun = upload(api, psf_file, "/v1/psfs"), image(api, tmp_path)
-    for steps in ("1", "3"):
-        api.post(f"/images/{sun}/start", data={**FORM, "psf_id": psf, "steps": steps})
-    run_jobs()
-    page = api.get(f"/images/{sun}").text
-    assert set(re.findall(r"richardson-lucy, (\d steps?), PSF 0\.0\.0", page)) == {"1 step", "3 steps"}
-    jobs = api.get("/jobs").text
-    assert jobs.count("Deconvolution <") == 2
-
-
 # Sentences ------------------------------------------------------------------------------------------
 
 
@@ -178,24 +148,17 @@ def test_a_message_becomes_a_sentence_without_words_for_programs() -> None:
     assert plain("") == ""
 
 
-def test_an_error_without_its_fields_is_told_too(subtests: pytest.Subtests) -> None:
+def test_an_error_with_and_without_its_fields() -> None:
     for code, message, told in (
         ("no-such-psf", "expected the id of a PSF; got x", "There is no such PSF here."),
-        ("no-such-context", "expected the id or name of a context; got x", "Expected the id or name"),
         ("channel-mismatch", "expected an image; got another", "Expected an image; got another."),
         ("invalid-request", "error_draws: x; valid_from: y", "Noise realisations: x; Valid from: y."),
-        ("not-fits", "expected a FITS file, got b'\\x00'", "This file is not a FITS file"),
         ("bad-key", "this key has expired", "This key has expired."),
+        ("not-fits", "expected a FITS file, got b'\\x00'", "This file is not a FITS file"),
     ):
-        with subtests.test(str((code, message, told))):
-            assert of_error(code, message).startswith(told)
-
-
-def test_the_advice_on_pixels_of_another_size() -> None:
+        assert of_error(code, message).startswith(told)
     fields = {"psf": "aia", "psf_arcsec": 0.6, "image_arcsec": "2.4 x 2.4", "factor": 4}
-    told = of_error("plate-scale-mismatch", "", fields)
-    assert "`heliopsf psf rebin PSF.fits --factor 4 -o BINNED.fits`" in told
-    assert told.startswith("The pixels of PSF aia are 0.6 arcsec wide, those of this image 2.4 x 2.4 arcsec.")
+    assert "rebin PSF.fits --factor 4" in of_error("plate-scale-mismatch", "", fields)
     assert "rebin" not in of_error("plate-scale-mismatch", "", fields | {"factor": None})
 
 
@@ -208,7 +171,7 @@ def test_a_wrong_address_is_a_sentence(api: TestClient) -> None:
 
 
 def test_a_high_artefact_score_comes_with_advice(
-    api: TestClient, settings: Settings, image_file: Path, psf_file: Path, run_jobs: Callable[[], None]
+    api: TestClient, catalogue: Catalogue, image_file: Path, psf_file: Path, run_jobs: Callable[[], None]
 ) -> None:
     image, psf = upload(api, image_file), upload(api, psf_file, "/v1/psfs")
     method = {"name": "linear", "steps": 2}
@@ -217,16 +180,13 @@ def test_a_high_artefact_score_comes_with_advice(
     run_jobs()
     (product,) = api.get("/v1/products").json()["items"]
     again = f"/images/{image}?psf_id={psf}&amp;method=linear&amp;steps=2&amp;again=1"
-    engine = create_engine(settings.catalogue_url)
     for score, advised in ((0.99, False), (1.0, True)):
         details = product["details"] | {"changes": {"artefacts": {"score": score}}}
-        with engine.begin() as connection:
-            connection.execute(update(ProductRow).values(details=details))
+        execute(catalogue, update(ProductRow).values(details=details))
         page = api.get(f"/products/{product['id']}").text
         assert ("The artefact score is 1 or more" in page) == advised, score
         assert page.count(f'href="{again}"') == 1 + advised, score
     assert "<dd>linear, 2 steps</dd>" in page
-    engine.dispose()
 
 
 def sentences(page: str) -> list[str]:
@@ -236,12 +196,7 @@ def sentences(page: str) -> list[str]:
 
 
 def test_a_product_whose_psf_was_deprecated_says_what_to_do(
-    api: TestClient,
-    settings: Settings,
-    image_file: Path,
-    psf_file: Path,
-    tmp_path: Path,
-    run_jobs: Callable[[], None],
+    api: TestClient, image_file: Path, psf_file: Path, tmp_path: Path, run_jobs: Callable[[], None]
 ) -> None:
     image, psf = upload(api, image_file), upload(api, psf_file, "/v1/psfs")
     line = {"instrument": "hri_euv", "channel": "174", "kind": "total"}
@@ -249,23 +204,16 @@ def test_a_product_whose_psf_was_deprecated_says_what_to_do(
     assert api.post(f"/v1/psfs/{psf}/status", json=certified).status_code == 200
     method = {"name": "linear", "steps": 2}
 
-    def made(**more: object) -> str:
-        asked = {"image_id": image, "psf_id": psf, "method": method, "other_channel": True, **more}
-        job = api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": asked}).json()
-        run_jobs()
-        return str(api.get(f"/v1/jobs/{job['id']}").json()["result"].rpartition("/")[2])
-
     def told(product: str) -> list[str]:
         return [one for one in sentences(api.get(f"/products/{product}").text) if "deprecated" in one]
 
-    before = made()
+    asked = {"image_id": image, "psf_id": psf, "method": method, "other_channel": True}
+    before = result_of(api, run_jobs, "deconvolve", **asked)["id"]
     assert told(before) == []
     wrong = {"status": "deprecated", "reason": "a <b>wrong</b> mesh"}
     assert api.post(f"/v1/psfs/{psf}/status", json=wrong).status_code == 200
-    assert told(before) == [
-        "The PSF of this product is deprecated (reason: a <b>wrong</b> mesh), and it has no replacement: "
-        "deconvolve the image again with another PSF."
-    ]
+    (said,) = told(before)
+    assert "(reason: a <b>wrong</b> mesh)" in said and "no replacement" in said
     assert f'<a href="/images/{image}?method=linear' in api.get(f"/products/{before}").text
 
     write_psf(tmp_path / "next.fits", scale=0.9)
@@ -274,22 +222,9 @@ def test_a_product_whose_psf_was_deprecated_says_what_to_do(
     named = {"status": "deprecated", "successor": better}
     assert api.post(f"/v1/psfs/{psf}/status", json=named).status_code == 200
     name = api.get(f"/v1/psfs/{better}").json()["name"]
-    expected = (
-        f"The PSF of this product is deprecated (reason: a <b>wrong</b> mesh), and its replacement is {name} 2.0.0: "
-        "deconvolve the image again with the replacement."
-    )
     page = api.get(f"/products/{before}").text
-    assert told(before) == [expected]
+    (said,) = told(before)
+    assert f"its replacement is {name} 2.0.0" in said
     assert f'<a href="/psfs/{better}">{name} 2.0.0</a>' in page
     assert f'<a href="/images/{image}?psf_id={better}&amp;method=linear&amp;steps=2' in page
     assert f'<a href="/psfs/{psf}">PSF of this product</a>' in page
-
-    after = made(method={"name": "linear", "steps": 1})
-    engine = create_engine(settings.catalogue_url)
-    with engine.connect() as connection:
-        kept = connection.scalar(select(ProductRow.details).where(ProductRow.id == after))["warnings"]
-    engine.dispose()
-    assert "psf-deprecated" in {one["code"] for one in kept}, "this product was made with the warning"
-    assert told(after) == [expected] and "was deprecated (" not in "".join(
-        sentences(api.get(f"/products/{after}").text)
-    )

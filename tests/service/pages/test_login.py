@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Iterator
 from http.cookies import SimpleCookie
 from pathlib import Path
 
@@ -22,12 +21,6 @@ from workers.settings import Settings
 OWN_PAGE = {"Sec-Fetch-Site": "same-origin"}
 PERSON = {"Accept": "text/html,application/xhtml+xml,application/xml;q=0.9,*/*;q=0.8"}
 COOKIE = "heliopsf_session"
-
-
-@pytest.fixture
-def service(settings: Settings) -> Iterator[Keyed]:
-    with keyed(settings) as running:
-        yield running
 
 
 def browser(service: Keyed, key: str | None = None, address: str = "http://testserver") -> TestClient:
@@ -109,58 +102,40 @@ def test_answers_that_caches_may_keep_depend_on_the_cookie(service: Keyed, psf_f
         assert "Cookie" in answer.headers["Vary"].split(", ")
 
 
-@pytest.mark.usefixtures("one_minute")
-def test_both_count_against_the_same_limit(settings: Settings) -> None:
-    with keyed(settings, reads_per_minute=40) as service:
-        key = service.key("ann")
-        client = browser(service, key)
-        left = [
-            int(re.search(r"r=(\d+)", client.get("/v1/jobs", headers=headers).headers["RateLimit"])[1])  # type: ignore[index]
-            for headers in ({}, bearer(key), {})
-        ]
-        assert left == [39, 38, 37]
-
-
 # Other sites ----------------------------------------------------------------------------------------
 
 CHANGES = (
     ("POST", "/v1/jobs"),
-    ("POST", "/v1/images"),
     ("DELETE", "/v1/jobs/" + 32 * "0"),
-    ("POST", "/uws/jobs"),
     ("POST", f"/uws/jobs/{32 * '0'}/phase"),
     ("POST", "/images/sample"),
-    ("POST", "/keys"),
     ("POST", "/logout"),
 )
 
 
-def test_a_form_of_another_site_changes_nothing(subtests: pytest.Subtests, service: Keyed) -> None:
+def test_a_form_of_another_site_changes_nothing(service: Keyed) -> None:
     client = browser(service, service.key("ann"))
     token = {"X-Form-Token": form_token(client)}
     for method, address in CHANGES:
         for headers in (
-            {"Sec-Fetch-Site": "cross-site"},
             {"Sec-Fetch-Site": "same-site"},
             {"Origin": "http://evil.example"},
             {"Origin": "null"},
         ):
-            with subtests.test(str((method, address, headers))):
-                answer = client.request(method, address, headers=headers | token)
-                assert answer.status_code == 403 and "another site" in answer.text
+            answer = client.request(method, address, headers=headers | token)
+            assert answer.status_code == 403 and "another site" in answer.text, (method, address, headers)
     assert client.get("/v1/jobs").status_code == 200, "still logged in"
 
 
-def test_a_change_that_names_no_site_needs_the_form_token(subtests: pytest.Subtests, service: Keyed) -> None:
+def test_a_change_that_names_no_site_needs_the_form_token(service: Keyed) -> None:
     client, other = browser(service, service.key("ann")), browser(service, service.key("ann"))
     token, of_another = form_token(client), form_token(other)
     for method, address in CHANGES:
-        with subtests.test(str((method, address))):
-            for headers in ({}, {"X-Form-Token": "x" * 43}, {"X-Form-Token": of_another}):
-                answer = client.request(method, address, headers=headers)
-                assert answer.status_code == 403 and "form token" in answer.text, answer.text
-            accepted = client.request(method, address, headers={"X-Form-Token": token})
-            assert accepted.status_code != 403, accepted.text
+        for headers in ({}, {"X-Form-Token": "x" * 43}, {"X-Form-Token": of_another}):
+            answer = client.request(method, address, headers=headers)
+            assert answer.status_code == 403 and "form token" in answer.text, answer.text
+        accepted = client.request(method, address, headers={"X-Form-Token": token})
+        assert accepted.status_code != 403, accepted.text
 
 
 def test_the_form_token_may_be_a_field_of_a_page_s_form(service: Keyed) -> None:
@@ -175,14 +150,10 @@ def test_the_form_token_may_be_a_field_of_a_page_s_form(service: Keyed) -> None:
         assert client.post("/keys", data={"scopes": "read"}, headers=headers).status_code == 201
 
 
-def test_a_program_with_a_key_needs_no_token(service: Keyed) -> None:
-    assert service.client("ann").post("/uws/jobs", data={"KIND": "deconvolve"}).status_code == 200
-
-
 # No window of the browser's own ---------------------------------------------------------------------
 
 
-def test_basic_is_offered_to_programs_alone(subtests: pytest.Subtests, service: Keyed) -> None:
+def test_basic_is_offered_to_programs_alone(service: Keyed) -> None:
     for headers, offered in (
         ({}, True),
         ({"Accept": "text/html, image/gif, image/jpeg, */*; q=0.2"}, True),  # Java's, as of TOPCAT
@@ -190,12 +161,9 @@ def test_basic_is_offered_to_programs_alone(subtests: pytest.Subtests, service: 
         (PERSON, False),
         ({"Cookie": f"{COOKIE}=ended"}, False),
     ):
-        with subtests.test(str((headers, offered))):
-            for address in ("/v1/jobs", "/uws/jobs"):
-                answer = service.api.get(address, headers=headers)
-                assert answer.status_code == 401
-                assert answer.headers["WWW-Authenticate"].startswith("Bearer")
-                assert ("Basic" in answer.headers["WWW-Authenticate"]) == offered
+        answer = service.api.get("/uws/jobs", headers=headers)
+        assert answer.status_code == 401 and answer.headers["WWW-Authenticate"].startswith("Bearer")
+        assert ("Basic" in answer.headers["WWW-Authenticate"]) == offered, headers
 
 
 # Beginning and end ----------------------------------------------------------------------------------
@@ -228,15 +196,7 @@ def test_a_wrong_key_is_refused_with_the_reason_and_counted(settings: Settings) 
         assert browser(service, service.key("ann")).cookies, "a good key is still accepted"
 
 
-@pytest.mark.usefixtures("one_minute")
-def test_logins_count_as_submissions_of_their_key(settings: Settings) -> None:
-    with keyed(settings, submissions_per_minute=2) as service:
-        data = {"key": service.key("ann")}
-        tried = [browser(service).post("/login", data=data).status_code for _ in range(3)]
-        assert tried == [303, 303, 429]
-
-
-def test_logging_out_ends_the_session_and_removes_the_cookie(service: Keyed) -> None:
+def test_logging_out_and_a_new_login_end_the_session_before(service: Keyed) -> None:
     client, other = browser(service, service.key("ann")), browser(service, service.key("ann"))
     token = client.cookies[COOKIE]
     answer = client.post("/logout", headers=OWN_PAGE)
@@ -244,15 +204,9 @@ def test_logging_out_ends_the_session_and_removes_the_cookie(service: Keyed) -> 
     assert not client.cookies
     client.cookies.set(COOKIE, token)
     assert client.get("/v1/jobs").status_code == 401, "the cookie alone is worth nothing any more"
-    assert other.get("/v1/jobs").status_code == 200
-
-
-def test_a_new_login_ends_the_one_before_it(service: Keyed) -> None:
-    client = browser(service, service.key("ann"))
-    token = client.cookies[COOKIE]
-    client.post("/login", data={"key": service.key("bob")}, headers=OWN_PAGE)
-    assert client.cookies[COOKIE] != token
-    assert client.get("/v1/keys").json()["items"][0]["owner"] == "bob"
+    token = other.cookies[COOKIE]
+    other.post("/login", data={"key": service.key("bob")}, headers=OWN_PAGE)
+    assert other.get("/v1/keys").json()["items"][0]["owner"] == "bob"
     with pytest.raises(KeyRefused, match="ended"):
         service.catalogue.sessions.find(token)
 
@@ -318,13 +272,16 @@ def test_an_open_service_needs_no_login(settings: Settings) -> None:
         assert api.get("/jobs").status_code == 200
         assert api.post("/logout").headers["location"] == "/login"
         assert "needs no login" in api.get("/login").text
+        assert "keys are not used" in api.get("/keys").text
+        assert api.post("/keys", data={"scopes": "read"}).status_code == 409
 
 
 # --- keys -----------------------------------------------------------------------------------------------
 
 
 def test_a_key_is_made_shown_once_and_revoked(service: Keyed) -> None:
-    client = browser(service, service.key("ann"))
+    own = service.key("ann")
+    client = browser(service, own)
     data = {"scopes": ["read", "submit"], "label": "cluster <1>", "lasts_days": "30", "owner": "ann"}
     answer = client.post("/keys", data=data, headers=OWN_PAGE)
     assert answer.status_code == 201 and answer.headers["Cache-Control"] == "no-store"
@@ -337,40 +294,26 @@ def test_a_key_is_made_shown_once_and_revoked(service: Keyed) -> None:
     revoked = client.post(f"/keys/{identity}/revoke", headers=OWN_PAGE)
     assert revoked.status_code == 303 and revoked.headers["location"] == "/keys"
     assert service.api.get("/v1/jobs", headers=bearer(key)).status_code == 401
-
-
-def test_revoking_the_key_of_the_login_ends_the_login(service: Keyed) -> None:
-    key = service.key("ann")
-    client = browser(service, key)
     made = client.post("/keys", data={"scopes": "read"}, headers=OWN_PAGE)
     (other,) = re.findall(r">(hpsf_[^<]+)</textarea>", made.text)
-    data = {"and_made": "true"}
-    client.post(f"/keys/{key.split('_')[1]}/revoke", data=data, headers=OWN_PAGE)
-    assert client.get("/keys").headers["location"].startswith("/login")
+    client.post(f"/keys/{own.split('_')[1]}/revoke", data={"and_made": "true"}, headers=OWN_PAGE)
+    assert client.get("/keys").headers["location"].startswith("/login"), "the key of the login"
     assert service.api.get("/v1/jobs", headers=bearer(other)).status_code == 401
 
 
-def test_what_cannot_be_made_is_told_on_a_page(subtests: pytest.Subtests, service: Keyed) -> None:
+def test_what_cannot_be_made_is_told_on_a_page(service: Keyed) -> None:
     client = browser(service, service.key("ann"))
     for data, told in (
         ({}, "at least one scope"),
-        ({"scopes": "everything"}, "at least one scope"),
-        ({"scopes": "read", "lasts_days": "-1"}, "a lifetime"),
         ({"scopes": "read", "lasts_days": "soon"}, "a lifetime"),
         ({"scopes": "read", "owner": "A B"}, "an owner"),
         ({"scopes": "admin"}, "scopes of your own key"),
         ({"scopes": "read", "owner": "bob"}, "your own name"),
     ):
-        with subtests.test(str((data, told))):
-            answer = client.post("/keys", data=data, headers=OWN_PAGE)
-            assert answer.status_code in (403, 422) and told in answer.text
-            assert answer.headers["content-type"].startswith("text/html")
-            assert len(service.catalogue.keys.all()) == 1
-
-
-def test_a_reader_sees_keys_and_can_change_none(service: Keyed) -> None:
-    page = browser(service, service.key("ann", Scope.READ)).get("/keys")
-    assert page.status_code == 200 and 'action="/keys"' not in page.text and "/revoke" not in page.text
+        answer = client.post("/keys", data=data, headers=OWN_PAGE)
+        assert answer.status_code in (403, 422) and told in answer.text
+        assert answer.headers["content-type"].startswith("text/html")
+        assert len(service.catalogue.keys.all()) == 1
 
 
 def test_an_administrator_sees_and_makes_keys_of_others(service: Keyed) -> None:
@@ -383,9 +326,3 @@ def test_an_administrator_sees_and_makes_keys_of_others(service: Keyed) -> None:
     owned = {row.owner: row.scopes for row in service.catalogue.keys.page("ann", limit=1)}
     assert owned == {"ann": ["bulk"]}
     assert browser(service, service.key("bob")).get("/keys?owner=ann").status_code == 403
-
-
-def test_an_open_service_uses_no_keys(settings: Settings) -> None:
-    with TestClient(create_app(settings)) as api:
-        assert "keys are not used" in api.get("/keys").text
-        assert api.post("/keys", data={"scopes": "read"}).status_code == 409

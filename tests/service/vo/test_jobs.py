@@ -185,28 +185,18 @@ def test_true_and_false_are_read_where_only_one_is_allowed(shared_api: TestClien
 
 
 BAD_CREATIONS = [
-    ("no KIND", {}, "expected KIND, one of deconvolve"),
     ("unknown KIND", {"KIND": "<rm -rf>"}, "got '<rm -rf>'"),
     ("unknown parameter", BUILD | {"colour": "red"}, "colour: there is no such field"),
-    ("not a number", BUILD | {"size": "big"}, "got 'big'"),
     ("odd size", BUILD | {"size": "127"}, "size: Input should be a multiple of 2; got 127"),
     ("not JSON", {"KIND": "deconvolve", "method": "{linear"}, "method: "),
-    ("JSON without end", {"KIND": "deconvolve", "method": "[" * 9000}, "method: "),
     ("NaN in JSON", {"KIND": "deconvolve", "noise": '{"photon_gain_dn": NaN, "read_noise_dn": 1}'}, "noise: "),
-    ("wrong inside", {"KIND": "deconvolve", "method": '{"name": "linear", "steps": 0}'}, "method/linear/steps"),
     ("missing inside", {"KIND": "deconvolve", "noise": '{"photon_gain_dn": 1}'}, "noise/read_noise_dn"),
     ("no XML", BUILD | {"instrument_file": "a\x00b"}, "characters that XML can hold"),
-    ("RUNID no XML", BUILD | {"RUNID": "a\x0bb"}, "RUNID"),
     ("RUNID too long", BUILD | {"RUNID": "a" * 300}, "RUNID"),
     ("PHASE", BUILD | {"PHASE": "NONSENSE"}, "expected PHASE=RUN or no PHASE; got 'NONSENSE'"),
-    ("ABORT at once", BUILD | {"PHASE": "ABORT"}, "expected PHASE=RUN"),
-    ("duration", BUILD | {"EXECUTIONDURATION": "-1"}, "EXECUTIONDURATION"),
     ("destruction", BUILD | {"DESTRUCTION": "2001-01-01"}, "a time in the future"),
-    ("no image there", {"KIND": "deconvolve", "PHASE": "RUN", "image_id": "0" * 64}, "the id of one of your images"),
     ("incomplete and RUN", {"KIND": "deconvolve", "PHASE": "RUN"}, "image_id: expected a value"),
-    ("neither of two", {"KIND": "psf-build", "PHASE": "RUN"}, "expected exactly one of instrument"),
     ("a misspelt KIND", {"KIND": "reprot"}, "did you mean 'report'?"),
-    ("a misspelt name", {"KIND": "deconvolve", "chnges_picture": "true"}, "did you mean 'changes_picture'?"),
 ]  # fmt: skip
 
 
@@ -221,23 +211,16 @@ def test_bad_creations(shared_api: TestClient) -> None:
 
 BAD_REQUESTS = [
     ("GET", "?WAIT=abc", {}, 400, "expected WAIT, a whole number of -1 or more; got 'abc'"),
-    ("GET", "?WAIT=-2", {}, 400, "WAIT"),
-    ("GET", "?WAIT=1.5", {}, 400, "WAIT"),
     ("GET", "?WAIT=1&wait=2", {}, 400, "expected WAIT once"),
     ("GET", "?WAIT=1&PHASE=NONSENSE", {}, 400, "expected PHASE, one of ABORTED"),
     ("POST", "", {"ACTION": "RUN"}, 400, "expected ACTION=DELETE"),
-    ("POST", "", {}, 400, "expected ACTION=DELETE"),
     ("POST", "/phase", {"PHASE": "NONSENSE"}, 400, "expected PHASE=RUN or PHASE=ABORT, got 'NONSENSE'"),
-    ("POST", "/phase", {}, 400, "expected PHASE=RUN"),
     ("POST", "/executionduration", {"EXECUTIONDURATION": "long"}, 400, "got 'long'"),
-    ("POST", "/executionduration", {"EXECUTIONDURATION": "-5"}, 400, "EXECUTIONDURATION"),
     ("POST", "/executionduration", {}, 400, "expected the field EXECUTIONDURATION"),
     ("POST", "/destruction", {"DESTRUCTION": "soon"}, 400, "expected DESTRUCTION, a time such as"),
     ("POST", "/destruction", {"DESTRUCTION": "1999-01-01T00:00:00Z"}, 400, "a time in the future"),
     ("POST", "/parameters", {"KIND": "report"}, 400, "expected KIND=psf-build"),
-    ("POST", "/parameters", {"size": "big"}, 400, "size: "),
     ("GET", "/results/result", {}, 404, "has no result"),
-    ("GET", "/results/%00", {}, 404, "has no result"),
     ("GET", "/error", {}, 404, "and has none"),
 ]
 
@@ -252,14 +235,6 @@ def test_bad_requests(shared_api: TestClient) -> None:
         assert (answer.status_code, answer.headers["content-type"][:10]) == (status, "text/plain"), case
         assert told in answer.text, case
         assert shared_api.get(job).content == before, "nothing has changed"
-
-
-def test_texts_that_are_no_ids(shared_api: TestClient) -> None:
-    """tests/service/http/test_owners.py asks every address for a job that is not there."""
-    for text in ("0" * 31, "A" * 32, "%00", "%3Cscript%3E", "a b", "\uff10" * 32):
-        for part in ("", "/results/result"):
-            answer = shared_api.get(f"{JOBS}/{text}{part}")
-            assert (answer.status_code, answer.headers["content-type"][:10]) == (404, "text/plain"), text
 
 
 def test_the_list_and_its_filters(api: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -279,7 +254,7 @@ def test_the_list_and_its_filters(api: TestClient, monkeypatch: pytest.MonkeyPat
     assert ids("?LAST=2") == everything[:2] and ids("?last=99999999999999") == everything
     assert ids("?PHASE=QUEUED") == [everything[0], everything[2]]
     assert ids("?PHASE=QUEUED&PHASE=ABORTED") == everything[:3]
-    assert ids("?PHASE=ARCHIVED") == ids("?PHASE=HELD&LAST=1") == []
+    assert ids("?PHASE=ARCHIVED") == []
     assert ids("?PHASE=PENDING&PHASE=QUEUED&LAST=2") == [everything[0], everything[2]]
 
     monkeypatch.setattr(uws, "MOST_LISTED", 3)
@@ -297,7 +272,7 @@ def test_the_list_and_its_filters(api: TestClient, monkeypatch: pytest.MonkeyPat
     assert ids("?" + urlencode({"AFTER": times[0]})) == []
     assert ids("?AFTER=2001-01-01") == everything
 
-    for query in ("?LAST=0", "?LAST=-1", "?LAST=few", "?AFTER=noon", "?PHASE=NONSENSE", "?LAST=1&LAST=2"):
+    for query in ("?LAST=0", "?LAST=few", "?AFTER=noon", "?PHASE=NONSENSE", "?LAST=1&LAST=2"):
         answer = api.get(JOBS + query)
         assert (answer.status_code, answer.headers["content-type"][:10]) == (400, "text/plain"), query
         assert "expected" in answer.text and "got" in answer.text
@@ -372,13 +347,11 @@ def test_forms_of_any_kind(api: TestClient) -> None:
     form = {"Content-Type": "application/x-www-form-urlencoded"}
     for answer, status in (
         (api.post(JOBS, json=BUILD), 415),
-        (api.post(JOBS, files={"KIND": ("a.txt", b"psf-build")}), 400),
+        (api.post(in_address.headers["location"] + "/phase", files={"PHASE": ("a.txt", b"RUN")}), 400),
         (api.post(JOBS, files=[(f"f{n}", (None, "v")) for n in range(65)]), 400),
         (api.post(JOBS, files={"KIND": (None, "deconvolve"), "a": (None, "b" * (2**20 + 1))}), 413),
         (api.post(JOBS, content=b"KIND=%ff", headers=form), 400),
-        (api.post(JOBS, content=b"KIND=psf-build&kind=psf-build", headers=form), 400),
         (api.post(JOBS, content=b"&".join(b"a%d=1" % n for n in range(200)), headers=form), 400),
-        (api.post(JOBS, content=b"KIND=" + b"a" * 2**21, headers=form), 413),
     ):
         assert (answer.status_code, answer.headers["content-type"][:10]) == (status, "text/plain"), (
             answer.text

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
 
-from tests.conftest import write_psf
-from tests.service.conftest import upload, work_through_bulks
 from workers.settings import Settings
 
 FEW = {"method": {"name": "richardson-lucy", "steps": 1}}
@@ -27,18 +24,6 @@ def settings(settings: Settings, tmp_path: Path) -> Settings:
 @pytest.fixture
 def out(tmp_path: Path) -> Path:
     return tmp_path / "out"
-
-
-@pytest.fixture
-def psf_id(api: TestClient, tmp_path: Path) -> str:
-    write_psf(tmp_path / "psf.fits")
-    return upload(api, tmp_path / "psf.fits", "/v1/psfs")
-
-
-@pytest.fixture
-def work(settings: Settings, api: TestClient) -> Callable[[], None]:
-    """Run turns until no bulk run has work."""
-    return lambda: work_through_bulks(settings)
 
 
 def started(api: TestClient, **request: Any) -> dict[str, Any]:

@@ -1,21 +1,23 @@
 """``DELETE /v1/bulk/{id}``: what stays, and what no longer counts in the quota. The jobs of a run
-cannot be stopped one by one."""
+cannot be stopped one by one.
+Products of bulk runs in the archive's own layout."""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
 
 from tests.conftest import write_image
-from tests.service.api.bulk.conftest import FEW
+from tests.service.api.bulk.conftest import FEW, failures, results, started
 from tests.service.conftest import refusal, upload, work_through_bulks
 from tests.service.keyed import Keyed
 from workers.bulk.runs import keep_turns
 from workers.catalogue.access import Scope
-from workers.catalogue.bulks import Bulks
 from workers.catalogue.tables import ProductRow
 from workers.contract.jobs import Phase
 from workers.settings import Settings
@@ -47,7 +49,7 @@ def psf(ann: TestClient, psf_file: Path) -> str:
     return upload(ann, psf_file, "/v1/psfs")
 
 
-def started(client: TestClient, images: list[str], psf: str, **more: object) -> str:
+def begun(client: TestClient, images: list[str], psf: str, **more: object) -> str:
     answer = client.post("/v1/bulk", json={"images": images, "psf_id": psf, "parameters": FEW, **more})
     assert answer.status_code == 202, answer.text
     return f"/v1/bulk/{answer.json()['id']}"
@@ -61,7 +63,7 @@ def test_the_run_goes_and_its_products_and_files_stay(
     service: Keyed, ann: TestClient, image: str, psf: str, work: Callable[[], None], out: Path
 ) -> None:
     before = used(service)
-    run = started(ann, [image], psf, output={"folder": str(out)})
+    run = begun(ann, [image], psf, output={"folder": str(out)})
     work()
     assert ann.get(run).json()["phase"] == "COMPLETED"
     (product,) = ann.get("/v1/products").json()["items"]
@@ -77,26 +79,16 @@ def test_the_run_goes_and_its_products_and_files_stay(
     for address in ("", "/results", "/failures", "/events"):
         assert ann.get(f"{run}{address}").json()["type"] == "urn:heliopsf:no-such-bulk"
     assert ann.delete(run).status_code == 404, "it is deleted once"
-    again = started(ann, [image], psf)
+    again = begun(ann, [image], psf)
     work()
     assert again != run and ann.get(again).json()["images"]["reused"] == 1, "the product is still known"
-
-
-def test_a_run_at_work_is_cancelled_first(ann: TestClient, image: str, psf: str) -> None:
-    run = started(ann, [image], psf)
-    detail = refusal(ann.delete(run), 409, "wrong-phase")
-    assert "RUNNING" in detail and "cancel it first" in detail
-    assert ann.get(run).json()["phase"] == "RUNNING"
-    assert ann.post(f"{run}/cancel").status_code == 200
-    assert ann.delete(run[: len("/v1/bulk/") + 12]).status_code == 204, "the first digits are enough"
-    assert ann.get(run).status_code == 404
 
 
 def test_turns_are_jobs_that_only_their_run_can_stop(
     service: Keyed, ann: TestClient, settings: Settings, image: str, psf: str
 ) -> None:
     before = used(service)
-    run = started(ann, [image], psf)
+    run = begun(ann, [image], psf)
     for _ in range(2):
         keep_turns(service.catalogue, settings)
         (turn,) = ann.get("/v1/jobs").json()["items"]
@@ -115,6 +107,7 @@ def test_turns_are_jobs_that_only_their_run_can_stop(
     assert submitter.delete(here, follow_redirects=False).status_code == 409
     row = service.catalogue.jobs.get(turn["id"])
     assert row is not None and not row.cancel_requested and row.phase == Phase.QUEUED
+    refusal(ann.delete(run), 409, "wrong-phase")
     assert ann.post(f"{run}/pause").status_code == 200 and ann.delete(run).status_code == 204
     row = service.catalogue.jobs.get(turn["id"])
     assert row is not None and row.phase == Phase.ABORTED
@@ -122,27 +115,82 @@ def test_turns_are_jobs_that_only_their_run_can_stop(
     assert ann.get("/v1/jobs").json()["items"] == [] and used(service) == before
 
 
-def test_a_run_deleted_while_its_image_is_at_work_leaves_nothing_open(
-    service: Keyed,
-    ann: TestClient,
-    psf: str,
-    work: Callable[[], None],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    for number in range(4):
-        write_image(tmp_path / f"{number}.fits", seed=number)
-    run = started(ann, [upload(ann, tmp_path / f"{number}.fits") for number in range(4)], psf)
-    real = Bulks.finish
-    deleted: list[bool] = []
+# --- products in the archive's own layout ----------------------------------------------------------------
 
-    def finish(*told: object, **values: object) -> bool:
-        if not deleted:
-            deleted.append(True)
-            assert ann.post(f"{run}/pause").status_code == 200 and ann.delete(run).status_code == 204
-        return real(*told, **values)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(Bulks, "finish", finish)
+Work = Callable[[], None]
+LAYOUT = "{telescop}/{date:%Y/%m/%d}/{stem}_deconvolved.fits"
+
+
+@pytest.fixture
+def archive(tmp_path: Path) -> Path:
+    """Files of equal names in the folders of two years; the third has no date."""
+    root = tmp_path / "archive"
+    for number, year in enumerate((2020, 2021, 2022)):
+        (root / str(year)).mkdir(parents=True)
+        date = {} if year == 2022 else {"DATE-BEG": f"{year}-03-01T12:00:00"}
+        write_image(root / str(year) / "one.fits", seed=number, **date)
+    return root
+
+
+def done(api: TestClient, work: Work, **request: Any) -> tuple[list[dict[str, Any]], dict[str, str]]:
+    """The results of a run, and the codes of its failures by file."""
+    bulk = started(api, **request)
     work()
-    assert service.catalogue.jobs.of_kind("bulk") == []
-    assert len(ann.get("/v1/products").json()["items"]) in (1, 2), "the images that were at work"
+    return results(api, bulk), {one["source"]: one["error"]["code"] for one in failures(api, bulk)}
+
+
+@pytest.mark.parametrize("only", [False, True])
+def test_products_have_the_names_of_the_layout(
+    api: TestClient, work: Work, archive: Path, out: Path, psf_id: str, only: bool
+) -> None:
+    output = {"folder": str(out), "layout": LAYOUT, "only": only}
+    request = {"files": [{"glob": f"{archive}/*/*"}], "psf_id": psf_id, "output": output}
+    lines, failed = done(api, work, **request)
+    wanted = [out / f"TEST/{year}/03/01/one_deconvolved.fits" for year in (2020, 2021)]
+    assert [line["output"] for line in lines] == list(map(str, wanted))
+    assert failed == {f"{archive}/2022/one.fits": "no-output-name"}
+    assert [hashlib.sha256(path.read_bytes()).hexdigest() for path in wanted] == [
+        line["sha256"] for line in lines
+    ]
+    assert sorted(path for path in out.rglob("*") if path.is_file()) == wanted, "nothing else is left"
+    again, _ = done(api, work, **request)
+    assert [line["reused"] for line in again] == [True, True]
+    assert [line["output"] for line in again] == list(map(str, wanted))
+
+
+def test_the_second_image_with_a_name_fails_and_replaces_nothing(
+    api: TestClient, work: Work, archive: Path, out: Path, psf_id: str
+) -> None:
+    output = {"folder": str(out), "layout": "{stem}.fits", "only": True}
+    request = {"files": [{"glob": f"{archive}/*/*"}], "psf_id": psf_id, "output": output}
+    told = api.post("/v1/bulk/estimate", json={"parameters": FEW, **request}).json()
+    assert [one["error"]["code"] for one in told["refused"]] == ["output-name-taken"] * 2
+    (line,), failed = done(api, work, **request)
+    assert set(failed.values()) == {"output-name-taken"} and len(failed) == 2
+    assert hashlib.sha256((out / "one.fits").read_bytes()).hexdigest() == line["sha256"]
+    assert [path.name for path in out.iterdir()] == ["one.fits"]
+
+
+def test_a_file_of_somebody_else_is_not_replaced(
+    api: TestClient, work: Work, archive: Path, out: Path, psf_id: str
+) -> None:
+    out.mkdir()
+    (out / "one.fits").write_text("a letter")
+    output = {"folder": str(out), "layout": "{stem}.fits"}
+    lines, failed = done(api, work, files=[{"glob": f"{archive}/2020/*"}], psf_id=psf_id, output=output)
+    assert lines == [] and list(failed.values()) == ["output-name-taken"]
+    assert (out / "one.fits").read_text() == "a letter"
+
+
+def test_a_link_in_the_output_folder_is_not_followed_out_of_it(
+    api: TestClient, work: Work, archive: Path, out: Path, psf_id: str
+) -> None:
+    (out / "elsewhere").mkdir(parents=True)
+    (out / "run").mkdir()
+    (out / "run" / "2020").symlink_to(out / "elsewhere")
+    output = {"folder": str(out / "run"), "layout": "{folder}/{stem}.fits"}
+    lines, failed = done(api, work, files=[{"glob": f"{archive}/202[01]/*"}], psf_id=psf_id, output=output)
+    assert failed == {f"{archive}/2020/one.fits": "path-not-allowed"}
+    assert [line["output"] for line in lines] == [str(out / "run" / "2021" / "one.fits")]
+    assert list((out / "elsewhere").iterdir()) == []

@@ -11,15 +11,14 @@ from typing import Any
 import prov
 import pytest
 from astropy.io import fits
-from fastapi.testclient import TestClient
 
+from psfcore.deconvolve import run
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.psfs import read_psf
 from service.cli.connection import short
 from service.client.http import Client, ServiceError
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
 from tests.fitted_psfs import EARLY, LATE, interpolated_on_a_small_grid, write_fitted
-from tests.service.vo.made import add_product
 
 Command = Callable[..., str]
 
@@ -47,23 +46,16 @@ def test_psfs_from_draft_to_deprecated(command: Command, client: Client, tmp_pat
     listed = command("psf", "list", "--instrument", "hri_euv")
     assert "p32  1.0.0  deprecated" in listed and "p48  1.1.0  certified" in listed
     third = uploaded(command, tmp_path, 64)
+    for nothing in ("", "xyz"):
+        assert "expected an id, or its first 8 or more" in command("psf", "delete", nothing, code=2)
+    fourth = uploaded(command, tmp_path, 16)
+    assert command("psf", "delete", fourth[:8]).startswith(f"deleted {fourth[:12]}  p16")
+    assert "never deleted" in command("psf", "delete", second, code=1)
     told = command("psf", "deprecate", second, "--reason", "wrong")
     assert told == "hri_euv/174/total 1.1.0: deprecated\nproducts made with it: 0\n"
     command("psf", "certify", third, "--version", "1.2.0")
     assert f"use {third}" in command("psf", "deprecate", second, "--successor", third)
     assert [one["reason"] for one in client.psf_status(second)["history"]] == ["", "wrong", ""]
-
-
-def test_a_draft_is_deleted_by_the_first_digits_of_its_id(
-    command: Command, client: Client, tmp_path: Path
-) -> None:
-    first, second = uploaded(command, tmp_path, 32), uploaded(command, tmp_path, 48)
-    for nothing in ("", "xyz"):
-        assert "expected an id, or its first 8 or more" in command("psf", "delete", nothing, code=2)
-    assert command("psf", "delete", first[:8]).startswith(f"deleted {first[:12]}  p32")
-    assert [row["id"][:12] for row in client.psfs()] == [second]
-    command("psf", "certify", second, "--version", "1.0.0")
-    assert "never deleted" in command("psf", "delete", second, code=1)
 
 
 def test_the_best_by_properties_and_by_an_image(command: Command, client: Client, tmp_path: Path) -> None:
@@ -82,29 +74,12 @@ def test_the_best_by_properties_and_by_an_image(command: Command, client: Client
     assert json.loads((tmp_path / "best.json").read_text())["psf"]["id"].startswith(first)
     assert command("psf", "best", "--image", image, "--version", "1.0.0", code=2)
     assert " has kind airy" in command("psf", "best", "--kind", "airy", code=1)
-    with pytest.raises(ServiceError) as caught:
-        client.best_psf(channel="193")
-    assert (caught.value.code, caught.value.status) == ("no-psf-fits", 404)
-
-
-def test_the_best_psf_for_an_image_is_the_one_that_deconvolve_uses(
-    command: Command, client: Client, tmp_path: Path
-) -> None:
-    hri = {"DETECTOR": "HRI_EUV", "TELESCOP": "SOLO/EUI/HRI_EUV", "WAVELNTH": 174.0}
-    write_image(tmp_path / "hri.fits", **hri, **{"DATE-BEG": "2020-05-05"})
-    told = command("psf", "best", "--image", tmp_path / "hri.fits", "--json", tmp_path / "b.json")
-    image_id = client.upload_image(tmp_path / "hri.fits")["id"]
-    wanted = client.estimate("deconvolve", image_id=image_id)["psf"]
-    assert told.startswith(f"{short(wanted['id'])}  hri_euv") and "not built yet" in told
-    assert "No PSF of hri_euv/174/total is certified" in told
-    assert json.loads((tmp_path / "b.json").read_text()) == {"psf": wanted, "why": wanted["why"]}
-    certified = uploaded(command, tmp_path, 32)
-    command("psf", "certify", certified, "--version", "1.0.0")
-    told = command("psf", "best", "--image", tmp_path / "hri.fits")
-    assert told.startswith(certified) and "This PSF is certified" in told
     write_image(tmp_path / "aia.fits", TELESCOP="SDO/AIA", INSTRUME="AIA_3", WAVELNTH=1600)
     told = command("psf", "best", "--image", tmp_path / "aia.fits", code=1)
     assert "--psf FILE.toml" in told and "psf fit TRANSIT" in told
+    with pytest.raises(ServiceError) as caught:
+        client.best_psf(channel="193")
+    assert (caught.value.code, caught.value.status) == ("no-psf-fits", 404)
 
 
 def test_contexts(command: Command, client: Client, tmp_path: Path) -> None:
@@ -124,10 +99,11 @@ def test_contexts(command: Command, client: Client, tmp_path: Path) -> None:
     assert command("context", "use", "--none") == "no default context: the certified PSFs are used\n"
     assert len(client.default_context()["history"]) == 2
     command("context", "use", code=2)
-    assert "expected the id or name of a context; got 'three'" in command("context", "use", "three", code=1)
 
 
-def test_lineage_and_rerun(command: Command, client: Client, tmp_path: Path) -> None:
+def test_lineage_and_rerun(
+    command: Command, client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "small.toml").write_text(SMALL_INSTRUMENT)
     write_image(tmp_path / "i.fits")
     psf = client.build_psf(tmp_path / "small.toml", size=64)
@@ -140,34 +116,27 @@ def test_lineage_and_rerun(command: Command, client: Client, tmp_path: Path) -> 
     assert told[1].startswith("  image ") and told[2].startswith(f"  psf {short(psf['id'])}")
     assert told[3].startswith("    instrument-file ")
     assert json.loads((tmp_path / "l.json").read_text())["id"] == product["id"]
+    for name in ("l.json", "l.provn"):
+        options = ("--product", "--prov", tmp_path / name, "--overwrite")
+        assert command("psf", "lineage", product["id"], *options).startswith("product ")
+        assert len(prov.read((tmp_path / name).read_bytes()).get_record(f"product:{product['id']}")) == 1
     again = command("psf", "rerun", psf["id"], "--json", tmp_path / "r.json")
     assert again == "The new PSF is the same file, bit for bit.\n"
     assert json.loads((tmp_path / "r.json").read_text())["same_file"] is True
     assert "bit for bit" in command("psf", "rerun", product["id"], "--product")
-    assert [item["product_id"] for item in client.affected(psf["id"])] == [product["id"]]
-    assert list(client.affected(superseded=True)) == []
-    write_psf(tmp_path / "own.fits")
-    own = command("psf", "upload", tmp_path / "own.fits").split()[0]
-    assert "was uploaded" in command("psf", "rerun", own, code=1)
-
-
-def test_a_rerun_that_differs_ends_with_status_1(
-    command: Command, client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from psfcore.deconvolve import run
-
-    write_image(tmp_path / "i.fits")
-    write_psf(tmp_path / "p.fits")
-    product = client.deconvolve(
-        tmp_path / "i.fits", psf_id=client.upload_psf(tmp_path / "p.fits")["id"], steps=2
-    )
     real = run.write_image
 
     def off(path: Path, image: Any, **how: Any) -> None:
         real(path, type(image)(**{**vars(image), "pixels": image.pixels * 1.001}), **how)
 
-    monkeypatch.setattr(run, "write_image", off)
-    assert "differs by at most 0.001" in command("psf", "rerun", product["id"], "--product", code=1)
+    with monkeypatch.context() as patched:
+        patched.setattr(run, "write_image", off)
+        assert "differs by at most 0.001" in command("psf", "rerun", product["id"], "--product", code=1)
+    assert [item["product_id"] for item in client.affected(psf["id"])] == [product["id"]]
+    assert list(client.affected(superseded=True)) == []
+    write_psf(tmp_path / "own.fits")
+    own = command("psf", "upload", tmp_path / "own.fits").split()[0]
+    assert "was uploaded" in command("psf", "rerun", own, code=1)
 
 
 def test_a_deprecated_psf_that_is_named_is_used_with_a_warning(
@@ -176,32 +145,17 @@ def test_a_deprecated_psf_that_is_named_is_used_with_a_warning(
     line = ("--instrument", "hri_euv", "--channel", "174", "--kind", "total")
     psf = command("psf", "upload", psf_file, *line).split()[0]
     command("psf", "certify", psf, "--version", "1.0.0")
-    for number in (1, 2):
-        write_image(tmp_path / f"{number}.fits", seed=number, DETECTOR="HRI_EUV", WAVELNTH=174)
+    write_image(tmp_path / "1.fits", DETECTOR="HRI_EUV", WAVELNTH=174)
     how = ("--psf", psf, "--steps", 1, "--other-channel")
     made = command("deconvolve", tmp_path / "1.fits", "-o", tmp_path / "o.fits", *how)
     assert "was deprecated" not in made
     command("psf", "deprecate", psf, "--reason", "wrong mesh")
     again = command("deconvolve", tmp_path / "1.fits", "-o", tmp_path / "o.fits", "--overwrite", *how)
     assert f"warning: PSF {psf} " in again and "deprecated (reason: wrong mesh)" in again
-    both = command("deconvolve", tmp_path / "1.fits", tmp_path / "2.fits", "-o", f"{tmp_path}/out/", *how)
-    for number in (1, 2):
-        assert f"warning: {tmp_path}/{number}.fits: PSF {psf} " in both
+    many = command("deconvolve", tmp_path / "1.fits", "-o", f"{tmp_path}/out/", *how)
+    assert f"warning: {tmp_path}/1.fits: PSF {psf} " in many
     bulk = command("bulk", "submit", "--upload", tmp_path / "1.fits", "--psf", psf, "--other-channel")
     assert f"warning: PSF {psf} was deprecated" in bulk
-
-
-def test_the_lineage_is_written_in_both_forms_of_prov(
-    api: TestClient, tmp_path: Path, command: Command
-) -> None:
-    ids = add_product(api, tmp_path)
-    for name in ("l.json", "l.provn"):
-        out = command("psf", "lineage", ids["product"][-64:], "--product", "--prov", tmp_path / name)
-        assert out.startswith("product ")
-        assert len(prov.read((tmp_path / name).read_bytes()).get_record(f"product:{ids['product']}")) == 1
-    assert (tmp_path / "l.provn").read_text().startswith("document")
-    again = command("psf", "lineage", ids["psf"], "--prov", tmp_path / "l.json", code=1)
-    assert "--overwrite" in again
 
 
 # --- interpolation in time ------------------------------------------------------------------------------
@@ -231,33 +185,21 @@ def test_a_series_is_interpolated_for_an_image_between_two_psfs(command: Command
     command("psf", "certify", early, "--version", "1.0.0", "--to", "2022-03-01")
     command("psf", "certify", late, "--version", "1.1.0", "--from", "2023-03-01")
     assert command("psf", "series") == f"{SERIES}  not interpolated\n"
-    image = tmp_path / "i.fits"
-    write_image(image, DETECTOR="HRI_EUV", WAVELNTH=174, **{"DATE-BEG": "2022-05-13T06:00:00"})
-    refused = command("psf", "best", "--image", image, code=1)
-    assert "valid_at 2022-05-13" in refused
     said = command("psf", "series", SERIES, "--interpolate", "--reason", "the mirrors age")
     assert said == f"{SERIES}  may be interpolated\n"
+    image = tmp_path / "i.fits"
+    write_image(image, DETECTOR="HRI_EUV", WAVELNTH=174, **{"DATE-BEG": "2022-05-13T06:00:00"})
     best = command("psf", "best", "--image", image)
     assert "not built yet" in best and f"{early} (fitted 1.0.0), which holds until 2022-03-01" in best
-
-    made = command("deconvolve", image, "-o", tmp_path / "o.fits", "--steps", 2)
-    with fits.open(tmp_path / "o.fits") as hdus:
-        psf_id, version = hdus[0].header["PSFID"], hdus[0].header["PSFVERS"]
-    assert psf_id[:12] in best and version == f"0.1.0+{psf_id[:8]}" and f" {version} (" in made
+    command("deconvolve", image, "-o", tmp_path / "o.fits", "--steps", 2)
+    psf_id = fits.getheader(tmp_path / "o.fits")["PSFID"]
+    assert psf_id[:12] in best
     lines = command("psf", "lineage", psf_id).splitlines()
     assert "hri_euv-interpolated" in lines[0]
     assert lines[1].startswith(f"  psf {early}  (fitted 1.0.0 certified; weight 0.800")
-    assert lines[2].startswith(f"  psf {late}  (fitted 1.1.0 certified; weight 0.200")
-
     command("context", "create", "2022")
     assert command("context", "show", "2022").count("may be interpolated") == 2
     assert command("psf", "series", SERIES, "--no-interpolate") == f"{SERIES}  not interpolated\n"
-    assert "valid_at 2022-05-13" in command("psf", "best", "--image", image, code=1)
-    assert psf_id[:12] in command("psf", "best", "--image", image, "--context", "2022")
-
-    command("psf", "deprecate", late, "--reason", "wrong")
-    (line,) = [line for line in command("psf", "list").splitlines() if "hri_euv-interpolated" in line]
-    assert "deprecated" in line and "[" not in line, "it never had a range of times"
 
 
 def test_two_psfs_are_interpolated_on_request(command: Command, tmp_path: Path) -> None:
@@ -279,7 +221,6 @@ def test_two_psfs_are_interpolated_on_request(command: Command, tmp_path: Path) 
 
 
 def test_options_that_do_not_belong_together(command: Command) -> None:
-    for words in (("psf", "series", SERIES), ("psf", "series", "--interpolate")):
-        assert "expected SERIES with --interpolate or --no-interpolate" in command(*words, code=2)
+    assert "expected SERIES with --interpolate" in command("psf", "series", SERIES, code=2)
     unknown = command("psf", "series", SERIES, "--interpolate", code=1)
     assert "expected a series of which a PSF was certified" in unknown and SERIES in unknown

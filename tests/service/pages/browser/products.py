@@ -15,17 +15,8 @@ from tests.conftest import write_psf
 
 # A rotated field beside the centre of the Sun, as instruments write it.
 COORDINATES = {
-    "CTYPE1": "HPLN-TAN",
-    "CTYPE2": "HPLT-TAN",
-    "CUNIT1": "arcsec",
-    "CUNIT2": "arcsec",
-    "CRPIX1": 120.25,
-    "CRPIX2": 80.5,
-    "CRVAL1": -412.3,
-    "CRVAL2": 655.1,
-    "CDELT1": 4.4,
-    "CDELT2": 4.5,
-    "CROTA2": 12.5,
+    **{"CTYPE1": "HPLN-TAN", "CTYPE2": "HPLT-TAN", "CUNIT1": "arcsec", "CUNIT2": "arcsec", "CROTA2": 12.5},
+    **{"CRPIX1": 120.25, "CRPIX2": 80.5, "CRVAL1": -412.3, "CRVAL2": 655.1, "CDELT1": 4.4, "CDELT2": 4.5},
 }
 
 

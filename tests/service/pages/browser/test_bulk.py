@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import time
 from pathlib import Path
 
 import pytest
@@ -67,43 +66,6 @@ def test_a_run_started_by_the_form_is_followed_to_its_end_without_a_reload(
     expect(page.get_by_role("link", name="quiet Sun")).to_be_visible()
 
 
-@pytest.mark.slow  # half a minute: it runs real jobs
-def test_a_run_is_paused_resumed_and_cancelled_and_another_tab_sees_it(
-    page: Page, site: Site, psf_id: str, tmp_path: Path
-) -> None:
-    images = uploaded(site, tmp_path, 9, side=2048, seed=600)
-    method = {
-        "name": "richardson-lucy",
-        "steps": 200,
-    }  # some seconds for each image: it must not end while the test looks
-    run = site.client.submit_bulk(images=images, psf_id=psf_id, name="long", method=method)
-    other = page.context.new_page()
-    other.goto("/bulk")
-    other.evaluate(MARK)
-    line = other.locator(f"[data-bulk='{run['id']}']")
-    page.goto(f"/bulk/{run['id']}")
-    page.evaluate(MARK)
-    expect(page.locator("[data-part=at_work]")).to_have_text("1", timeout=LONG_MS)
-    expect(page.locator("[data-part=pace]")).to_contain_text("an hour", timeout=LONG_MS)
-    # The pace appears after some images; how many are done by then depends on the machine.
-    expect(page.locator("#newer")).to_contain_text(re.compile("image is done|images are done"))
-    assert page.evaluate("window.notReloaded")
-    expect(line.locator("[data-part=pace]")).to_contain_text("an hour")
-
-    page.get_by_role("button", name="Pause").click()
-    expect(page.locator("[data-part=phase]")).to_have_text("PAUSED")
-    expect(line.locator("[data-part=phase]")).to_have_text("PAUSED")
-    expect(page.get_by_role("button", name="Resume")).to_be_visible()
-    good(page)
-    page.get_by_role("button", name="Resume").click()
-    expect(page.locator("[data-part=phase]")).to_have_text("RUNNING")
-    page.get_by_text("Cancel", exact=True).click()
-    page.get_by_role("button", name="Cancel the run").click()
-    expect(page.locator("[data-part=phase]")).to_have_text("CANCELLED")
-    expect(line.locator("[data-part=phase]")).to_have_text("CANCELLED")
-    assert other.evaluate("window.notReloaded")
-
-
 def test_a_run_is_deleted_and_other_tabs_see_it(page: Page, site: Site, psf_id: str, tmp_path: Path) -> None:
     images = uploaded(site, tmp_path, 2, side=256, seed=760)
     run = site.client.submit_bulk(images=images, psf_id=psf_id, name="not needed")
@@ -152,36 +114,3 @@ def test_a_run_whose_images_fail_says_so_without_a_reload(
     line = page.locator(f"[data-bulk='{run['id']}'] [data-part=phase]")
     expect(line).to_have_text("COMPLETED, 1 of 1 failed")
     expect(line).to_have_class("phase flawed")
-
-
-@pytest.mark.slow  # half a minute: it runs real jobs
-def test_failures_are_grouped_and_retried(page: Page, site: Site, psf_id: str, tmp_path: Path) -> None:
-    # Without --again a product is not deconvolved: all these images fail for one reason.
-    path = tmp_path / "<b>product.fits"
-    images = []
-    for number in range(3):
-        write_image(path, seed=700 + number, PSFID="0" * 64)
-        images.append(str(site.client.upload_image(path)["id"]))
-        path.unlink()
-    good_one = uploaded(site, tmp_path, 1, side=128, seed=720)
-    run = site.client.submit_bulk(images=[*images, *good_one], psf_id=psf_id, name="mixed")
-    site.client.wait_for_bulk(run["id"])
-    page.goto(f"/bulk/{run['id']}")
-    row = page.get_by_role("region", name="Failures by reason").locator("tbody tr")
-    expect(row).to_have_count(1)
-    expect(row.locator("td").first).to_have_text("3")
-    expect(row).to_contain_text("<b>product.fits")
-    good(page)
-    page.get_by_role("link", name="All failed images").click()
-    expect(page.locator("tbody tr")).to_have_count(3)
-    good(page)
-    page.goto(f"/bulk/{run['id']}")
-    before = time.time()
-    page.get_by_role("button", name="Retry the failed images").click()
-    wait_for(
-        lambda: all((one["ended_at"] or 0) > before for one in site.client.bulk_failures(run["id"])),
-        "no failure is older than the retry",
-    )
-    expect(page.locator("[data-part=phase]")).to_have_text("COMPLETED, 3 of 4 failed")
-    expect(page.locator("[data-part=failed]")).to_have_text("3")
-    assert len(list(site.client.bulk_failures(run["id"]))) == 3

@@ -14,7 +14,7 @@ from sqlalchemy import create_engine, update
 
 from tests.conftest import write_image, write_psf
 from tests.service.pages.browser.checks import good
-from tests.service.pages.browser.conftest import LONG_MS, PLAIN_NAME, Site, Watch
+from tests.service.pages.browser.conftest import PLAIN_NAME, Site, Watch
 from tests.whole.stack import Stack
 from workers.catalogue.access import Scope, SessionRow
 from workers.settings import Settings
@@ -68,28 +68,9 @@ def test_a_person_logs_in_makes_a_key_and_logs_out(page: Page, owner: str, key: 
     expect(page.get_by_role("heading", level=1)).to_have_text("Log in")
 
 
-def test_a_person_with_a_key_comes_from_the_login_to_a_product(page: Page, key: str, tmp_path: Path) -> None:
-    write_image(tmp_path / "sun.fits", shape=(96, 128))
-    write_psf(tmp_path / "psf.fits")
-    page.goto("/psfs")
-    log_in(page, key)
-    page.set_input_files("#psf-file", tmp_path / "psf.fits")
-    page.get_by_role("button", name="Upload a PSF of unknown kind").click()
-    expect(page).to_have_url(re.compile("/psfs/[0-9a-f]{64}$"), timeout=20_000)
-    psf_id = urlsplit(page.url).path.rpartition("/")[2]
-    page.goto("/")
-    page.set_input_files("#file", tmp_path / "sun.fits")
-    expect(page).to_have_url(re.compile("/images/[0-9a-f]{64}$"))
-    page.goto(f"{page.url}?psf_id={psf_id}&steps=3")
-    page.get_by_role("button", name="Start").click()
-    expect(page).to_have_url(re.compile("/products/[0-9a-f]{64}"), timeout=LONG_MS)
-    expect(page.locator("#zoom")).to_contain_text("%")
-
-
 @pytest.mark.parametrize(
     ("address", "place", "button", "size"),
     [
-        ("/", "#file", "Upload", 96),
         # A refusal that comes before the end of the file.
         ("/", "#file", "Upload", 2400),
         ("/psfs", "#psf-file", "Upload a whole PSF", 96),
@@ -142,14 +123,6 @@ def end_sessions(stack: Stack, key: str) -> None:
         of_key = SessionRow.key_id == key.split("_")[1]
         connection.execute(update(SessionRow).where(of_key).values(expires_at=time.time() - 1))
     engine.dispose()
-
-
-def test_a_wrong_key_is_told(page: Page, watch: Watch) -> None:
-    watch.allowed.append("401")
-    page.goto("/login")
-    log_in(page, "hpsf_nonsense")
-    expect(page.get_by_role("alert")).to_contain_text("This is not a key.")
-    good(page)
 
 
 def test_the_api_answers_401_without_a_window_of_the_browser(page: Page, watch: Watch) -> None:

@@ -242,34 +242,6 @@ def script(page: Page, name: str, expression: str) -> Any:
     )
 
 
-def test_the_functions_of_the_scripts_equal_numpy(page: Page, looked: Looked) -> None:
-    opened(page, looked)
-    np.testing.assert_array_equal(table(page, "EUV"), euv_levels())
-    neutral = table(page, "change")[127:129].astype(int)
-    assert np.ptp(neutral) < 10 and (neutral[0] == neutral[1]).all()
-    values = np.float32(np.random.default_rng(3).uniform(-50, 2000, 5000))
-    listed = json.dumps([float(value) for value in values])
-    for stretch in FORWARD:
-        limits = f"module.levelLimits({json.dumps(stretch)}, {LOW}, {HIGH})"
-        found = script(
-            page,
-            "stretch.js",
-            f"(() => {{ const limits = {limits}; return {listed}.map((v) => module.levelOf(v, limits)); }})()",
-        )
-        np.testing.assert_array_equal(found, levels(values, stretch))
-    texts = script(page, "stretch.js", f"Array.from(Float32Array.from({listed}), module.exactText)")
-    assert [np.float32(text) for text in texts] == list(values)
-    wanted = [0, 0.1, 33.3, 50, 99.9, 100]
-    mixed = np.concatenate([values, -values[:700]])
-    found = script(
-        page,
-        "stretch.js",
-        f"module.percentiles([Float32Array.from({listed}), Float32Array.from({listed}.slice(0, 700).map((v) => -v)), "
-        f"Float32Array.of(NaN, Infinity)], {wanted})",
-    )
-    np.testing.assert_allclose(found, np.percentile(mixed.astype(np.float64), wanted), rtol=1e-13)
-
-
 def said(page: Page, name: str) -> str:
     text = page.locator(f'[data-value="{name}"]').text_content()
     assert text is not None

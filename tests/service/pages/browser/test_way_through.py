@@ -7,11 +7,11 @@ import re
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, Locator, Page, expect
+from playwright.sync_api import Locator, Page, expect
 
 from tests.conftest import write_image, write_psf
 from tests.service.pages.browser.checks import good
-from tests.service.pages.browser.conftest import LONG_MS, Site, logged_in
+from tests.service.pages.browser.conftest import LONG_MS, Site
 from tests.transit_files import write_transit
 
 MOST_TABS = 60
@@ -28,26 +28,6 @@ def psf_id(site: Site, tmp_path: Path) -> str:
     write_psf(tmp_path / "psf.fits", size=64)
     identity: str = site.client.upload_psf(tmp_path / "psf.fits")["id"]
     return identity
-
-
-def test_an_image_without_a_psf_says_what_to_do_and_goes_on_with_one(
-    page: Page, image_file: Path, psf_id: str
-) -> None:
-    page.goto("/")
-    page.set_input_files("#file", image_file)
-    expect(page).to_have_url(re.compile("/images/[0-9a-f]{64}$"))
-    expect(page.locator("#checked")).to_contain_text("No PSF for TEST is known here.")
-    start = page.locator("#go")
-    expect(start).to_be_disabled()
-    good(page)
-
-    page.locator("select[name=psf_id]").select_option(psf_id)
-    expect(page.locator("#checked")).to_have_class("good")
-    expect(page.locator("#checked")).to_contain_text(f"PSF psf 0.0.0+{psf_id[:8]} (draft)")
-    expect(page.locator("#ways")).to_be_hidden()
-    expect(start).to_have_text("Start")
-    start.click()
-    expect(page).to_have_url(re.compile("/products/[0-9a-f]{64}"), timeout=LONG_MS)
 
 
 def test_options_are_checked_when_they_change(page: Page, site: Site, image_file: Path, psf_id: str) -> None:
@@ -78,21 +58,6 @@ def test_options_are_checked_when_they_change(page: Page, site: Site, image_file
     expect(page.get_by_label("Read noise (DN)")).to_have_value("1.5")
     expect(page.locator("input[name=error_draws]")).to_have_value("8")
     expect(go).to_have_text("Open the product")
-
-
-def test_options_are_kept_without_scripts(browser: Browser, image_file: Path, site: Site) -> None:
-    image = site.client.upload_image(image_file)["id"]
-    with browser.new_context(java_script_enabled=False, base_url=site.client.server) as context:
-        page = logged_in(context, site).new_page()
-        page.goto(f"/images/{image}")
-        page.locator("input[name=steps]").fill("9")
-        page.get_by_label("Allow a file that was deconvolved before").check()
-        page.locator("#go").click()
-        expect(page).to_have_url(re.compile(f"/images/{image}[?]"))
-        expect(page.locator("#checked")).to_contain_text("No PSF for TEST is known here.")
-        expect(page.locator("input[name=steps]")).to_have_value("9")
-        expect(page.get_by_label("Allow a file that was deconvolved before")).to_be_checked()
-        expect(page.get_by_role("button", name="Check these options")).to_be_visible()
 
 
 def test_a_dropped_file_is_sent(page: Page, image_file: Path) -> None:
@@ -137,6 +102,9 @@ def test_a_psf_is_uploaded_where_the_page_says_that_none_is_known(
     page.goto("/")
     page.set_input_files("#file", image_file)
     expect(page.locator("#checked")).to_have_class("error")
+    expect(page.locator("#checked")).to_contain_text("No PSF for TEST is known here.")
+    expect(page.locator("#go")).to_be_disabled()
+    good(page)
     page.get_by_label("Upload a PSF").set_input_files(tmp_path / "mine.fits")
     expect(page).to_have_url(re.compile("[?]psf_id=[0-9a-f]{64}$"))
     expect(page.locator("#checked")).to_have_class("good")
@@ -252,21 +220,3 @@ def test_the_keyboard_alone_leads_from_a_file_to_a_blinked_product(
     expect(shown).to_have_text("after" if first == "before" else "before")
     page.keyboard.press("b")
     expect(shown).to_have_text(first)
-
-
-@pytest.mark.slow  # the PSF of the instrument is built in half a minute; the tests above go the same way with a small PSF
-def test_a_real_image_becomes_a_product_that_is_blinked(page: Page, shared: Path) -> None:
-    """Two clicks (choose, Start) and one key, without any option."""
-    page.goto("/")
-    page.set_input_files(
-        "#file", shared / "data/real/eui/derived_hrieuv174_20220401T103005920_pseudolinear.fits"
-    )
-    expect(page).to_have_url(re.compile("/images/[0-9a-f]{64}$"), timeout=LONG_MS)
-    page.get_by_role("button", name="Start").click()
-    expect(page).to_have_url(re.compile("/products/[0-9a-f]{64}"), timeout=5 * LONG_MS)
-    page.locator("#mode").select_option("blink")
-    shown = page.locator("#tag-left")
-    expect(shown).to_have_text(re.compile("before|after"))
-    first = shown.inner_text()
-    page.locator("#canvas").press("b")
-    expect(shown).to_have_text("after" if first == "before" else "before")
