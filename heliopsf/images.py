@@ -285,7 +285,8 @@ def _clipped(image: Image, *, clip_negative: bool | None, method: str) -> Image:
         raise DataError(
             "negative-pixels",
             f"clip_negative=False: expected an image without negative pixels, or a method whose results may be negative "
-            f'("linear", "basic-iterative"); got {np.count_nonzero(negative)} negative pixels and {method!r}',
+            f'("linear", "basic-iterative"); got {np.count_nonzero(negative)} negative pixels and {method!r}: use '
+            "clip_negative=True or another method",
         )
     return image
 

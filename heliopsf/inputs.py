@@ -154,7 +154,8 @@ def hdu_of(hdus: fits.HDUList, number: int | None = None) -> Any:
     if not numbers:
         raise DataError(
             "no-image",
-            f"expected an HDU with an image of two axes; got {len(hdus)} HDUs, images in {with_image}",
+            f"expected an HDU with an image of two axes; got {len(hdus)} HDUs, images in {with_image}: "
+            + ("choose one of these" if with_image else "use a file with an image"),
         )
     return hdus[numbers[0]]
 

@@ -81,7 +81,10 @@ def level_dn(level: Any, header: Mapping[str, Any]) -> float | None:
     if isinstance(level, units.Quantity) and any(level.unit.is_equivalent(one) for one in rates):
         exposure_s = optional_exposure_s(header)
         if exposure_s is None:
-            message = f"expected XPOSURE or EXPTIME in the header, because saturation_dn is in {level.unit}; got neither"
+            message = (
+                f"expected XPOSURE or EXPTIME in the header, because saturation_dn is in {level.unit}; got neither: give "
+                "the level in DN"
+            )
             raise DataError("no-exposure", message)
         return number("saturation_dn", level, *rates) * exposure_s
     return number("saturation_dn", level, *COUNTS)

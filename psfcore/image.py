@@ -67,7 +67,8 @@ class Image:
         if bad.any() and (bad & self.finite).any():
             raise DataError(
                 "unmasked-nonfinite",
-                "expected every NaN or infinite pixel to be masked; got at least one such pixel without a mask",
+                "expected every NaN or infinite pixel to be masked; got at least one such pixel without a mask: set "
+                "MaskBit.NONFINITE in its mask",
             )
 
     def warned(self, warnings: Mapping[str, str]) -> Image:

@@ -93,7 +93,9 @@ class Psf:
 
 def _check_weights(kernel: Kernel) -> None:
     if kernel.ndim != 2:
-        raise DataError("psf-not-2d", f"expected weights with two axes; got shape {kernel.shape}")
+        raise DataError(
+            "psf-not-2d", f"expected weights with two axes; got shape {kernel.shape}: give one plane"
+        )
     if min(kernel.shape) < SMALLEST_SIDE_PX:
         raise DataError(
             "psf-too-small", f"expected at least {SMALLEST_SIDE_PX} px per side; got shape {kernel.shape}"
@@ -101,11 +103,15 @@ def _check_weights(kernel: Kernel) -> None:
     if not np.isfinite(kernel).all():
         bad = int(np.count_nonzero(~np.isfinite(kernel)))
         raise DataError(
-            "psf-nonfinite", f"expected finite weights; got {bad} weights that are NaN or infinite"
+            "psf-nonfinite",
+            f"expected finite weights; got {bad} weights that are NaN or infinite: replace them, for example by 0",
         )
     smallest = float(kernel.min())
     if smallest < -1e-12 * max(float(kernel.max()), 0.0):
-        raise DataError("psf-negative", f"expected weights >= 0; the smallest is {smallest:.3g}")
+        raise DataError(
+            "psf-negative",
+            f"expected weights >= 0; the smallest is {smallest:.3g}: set negative weights to 0, and divide all by their sum",
+        )
     # The sum is defined over the full reach; a larger array may sum to more than 1.
     within = (min(kernel.shape[0], REACH_GRID_PX), min(kernel.shape[1], REACH_GRID_PX))
     total = float((kernel if kernel.shape == within else crop_centred(kernel, within)).sum())

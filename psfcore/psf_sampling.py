@@ -157,7 +157,9 @@ def check_compatible(image: Image, psf: Psf) -> None:
         if abs(scale / psf.plate_scale_arcsec - 1) > PLATE_SCALE_TOLERANCE:
             expected = f"{psf.plate_scale_arcsec:g} arcsec/px, the plate scale of PSF {psf.name}"
             raise DataError(
-                "plate-scale-mismatch", f"expected {expected}; got CDELT{axis} = {scale:g} arcsec/px"
+                "plate-scale-mismatch",
+                f"expected {expected}; got CDELT{axis} = {scale:g} arcsec/px: choose a PSF of the same instrument and "
+                "binning",
             )
 
 

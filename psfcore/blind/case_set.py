@@ -93,10 +93,12 @@ class BlindSet:
             except (ValueError, KeyError, TypeError) as error:
                 raise DataError(
                     "bad-seals",
-                    f"expected lines with a case and its sha256 in {self.seals_file.name}; got {line!r:.60}",
+                    f"expected lines with a case and its sha256 in {self.seals_file.name}; got {line!r:.60}: make the "
+                    "set again in another folder",
                 ) from error
             if found.setdefault(number, seal) != seal:
-                raise DataError("bad-seals", f"expected one seal per case; got two for case {number:04d}")
+                message = f"expected one seal per case; got two for case {number:04d}: make the set again in another folder"
+                raise DataError("bad-seals", message)
         return found
 
     def keep_truth(self, number: int, truth: dict[str, Any]) -> str:

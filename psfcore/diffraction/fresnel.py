@@ -95,7 +95,7 @@ def grid_for(
         raise DataError(
             "too-many-samples",
             f"{plane}: expected a distance to the next plane that needs at most {MOST_SAMPLES} samples; "
-            f"got {distance_mm:g} mm, which needs {samples}",
+            f"got {distance_mm:g} mm, which needs {samples}: make this distance longer",
         )
     return Grid(plane, samples, step_mm, wavelength_mm)
 

@@ -220,7 +220,10 @@ def light_path(instrument: Instrument) -> LightPath:
 
 
 def _lacking(instrument: Instrument, key: str, expected: str, got: str) -> DataError:
-    return DataError("bad-instrument-file", f"{instrument.name}: {key}: expected {expected}; got {got}")
+    return DataError(
+        "bad-instrument-file",
+        f"{instrument.name}: {key}: expected {expected}; got {got}: correct the file, or choose another instrument",
+    )
 
 
 @dataclass(frozen=True)

@@ -169,7 +169,9 @@ def _mask_picture(
 ) -> MaskPicture:
     key = "mount.mask_image"
     if pixels is None:
-        raise DataError("bad-mount", f"{key}: expected the pixels of {described.file}; got none")
+        raise DataError(
+            "bad-mount", f"{key}: expected the pixels of {described.file}; got none: give them as mount_image"
+        )
     if pixels.ndim != 2 or pixels.shape[0] != pixels.shape[1] or pixels.size == 0:
         raise DataError(
             "bad-mount", f"{key}: expected a square image with two axes; got shape {pixels.shape}"

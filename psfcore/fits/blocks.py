@@ -206,7 +206,10 @@ def walk(source: Source, limits: FitsLimits) -> Iterator[Hdu]:
         yield hdu
         skip_data(source, hdu, limits)
         source.skip(-hdu.end % BLOCK_BYTES)
-    message = f"expected at most {limits.max_hdus} HDUs, and an image in one of them; got more HDUs"
+    message = (
+        f"expected at most {limits.max_hdus} HDUs, and an image in one of them; got more HDUs: write the image into a "
+        "file of its own"
+    )
     raise HeaderError("too-many-hdus", message)
 
 
@@ -246,7 +249,7 @@ def _check_size(source: Source, hdu: Hdu, limits: FitsLimits) -> None:
     if source.gzipped and size > limits.max_pixels * 16:
         message = (
             f"expected at most {limits.max_pixels * 16} bytes of data in an HDU; HDU {hdu.number} declares "
-            f"{size}"
+            f"{size}: decompress the file, or write the image into a file of its own"
         )
         raise HeaderError("too-many-bytes", message)
 
@@ -290,7 +293,10 @@ def _read_header(source: Source, most: int, limits: FitsLimits, *, first: bool) 
             got = f"the file stops after {len(raw)} bytes of this header"
             message = f"expected an END card; {got}: copy the file again"
             raise HeaderError("truncated-header", message)
-    message = f"expected at most {limits.max_header_bytes} bytes of headers, each with an END card; got more"
+    message = (
+        f"expected at most {limits.max_header_bytes} bytes of headers, each with an END card; got more: write the image "
+        "into a file of its own, with fewer cards"
+    )
     raise HeaderError("header-too-long", message)
 
 
@@ -355,9 +361,13 @@ def _check_image(header: Header, limits: FitsLimits) -> None:
         raise bad_card(f"{z}BITPIX of {_BITPIX}", bitpix)
     nx, ny = (card_count(header, f"{z}NAXIS{axis}") for axis in (1, 2))
     if nx == 0 or ny == 0:
-        raise HeaderError("zero-size", f"expected at least one pixel on each axis; got {nx} x {ny}")
+        raise HeaderError(
+            "zero-size", f"expected at least one pixel on each axis; got {nx} x {ny}: use another image"
+        )
     if nx * ny > limits.max_pixels:
-        message = f"expected at most {limits.max_pixels} pixels; got {nx} x {ny} = {nx * ny}"
+        message = (
+            f"expected at most {limits.max_pixels} pixels; got {nx} x {ny} = {nx * ny}: use a smaller image"
+        )
         raise HeaderError("too-many-pixels", message)
     if z:
         check_compression(header, nx, ny)
@@ -387,6 +397,7 @@ def _data_bytes(header: Header, hdu: int) -> int:
     if size > LARGEST_COUNT:
         raise HeaderError(
             "bad-card",
-            f"expected a data size below 2^63 bytes in HDU {hdu}; its header declares {size:.3g} bytes",
+            f"expected a data size below 2^63 bytes in HDU {hdu}; its header declares {size:.3g} bytes: copy or "
+            "make the file again",
         )
     return size

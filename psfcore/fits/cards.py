@@ -36,7 +36,7 @@ def card_trouble() -> tuple[type[Exception], ...]:
 
 def bad_card(expected: str, got: object) -> HeaderError:
     """The error for a card that the software cannot use."""
-    return HeaderError("bad-card", f"expected {expected}; got {got}")
+    return HeaderError("bad-card", f"expected {expected}; got {got}: copy or make the file again")
 
 
 def card_value(header: Header, key: str) -> object:
@@ -50,7 +50,8 @@ def card_value(header: Header, key: str) -> object:
     except HeaderError:
         raise
     except card_trouble():
-        raise HeaderError("bad-card", f"expected a readable card {key}; its value cannot be read") from None
+        message = f"expected a readable card {key}; its value cannot be read: copy or make the file again"
+        raise HeaderError("bad-card", message) from None
 
 
 def card_count(

@@ -104,7 +104,7 @@ def check_compression(header: Header, nx: int, ny: int) -> None:
     """
     codec = card_text(header, "ZCMPTYPE")
     if codec not in ALLOWED_CODECS:
-        message = f"expected compression by one of {', '.join(ALLOWED_CODECS)}; got {codec}"
+        message = f"expected compression by one of {', '.join(ALLOWED_CODECS)}; got {codec}: decompress the file (funpack)"
         raise HeaderError("codec-not-allowed", message)
     _check_keywords(header)
     _check_tiling(header, nx, ny)
@@ -137,11 +137,14 @@ def _check_tiling(header: Header, nx: int, ny: int) -> None:
     tile_x, tile_y = card_count(header, "ZTILE1", default=nx), card_count(header, "ZTILE2", default=1)
     if not (1 <= tile_x <= _LARGEST_INT and 1 <= tile_y <= _LARGEST_INT):
         expected = f"expected tiles of 1 to {_LARGEST_INT} pixels on each axis"
-        raise HeaderError("bad-tiles", f"{expected}; got {tile_x} x {tile_y}")
+        raise HeaderError("bad-tiles", f"{expected}; got {tile_x} x {tile_y}: copy or make the file again")
     tiles = math.prod(-(-n // tile) for n, tile in ((nx, tile_x), (ny, tile_y)))
     rows = card_count(header, "NAXIS2")
     if rows != tiles:
-        message = f"expected one table row per tile, {tiles} rows for {nx} x {ny} pixels; got {rows}"
+        message = (
+            f"expected one table row per tile, {tiles} rows for {nx} x {ny} pixels; got {rows}: copy or make the file "
+            "again"
+        )
         raise HeaderError("bad-tiles", message)
     if tiles > MOST_TILES:
         raise HeaderError("bad-tiles", f"expected at most {MOST_TILES} tiles; got {tiles}: use larger tiles")

@@ -163,7 +163,8 @@ def decode_tiles(
         data = _tiles(path, number)
         if data.shape != tuple(shape):
             raise DataError(
-                "unreadable-pixels", f"expected {shape} pixels, as the header declares; got {data.shape}"
+                "unreadable-pixels",
+                f"expected {shape} pixels, as the header declares; got {data.shape}: copy or make the file again",
             )
         if twice:
             fill_new_memory(_OTHER_FILLING)

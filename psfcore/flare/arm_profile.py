@@ -244,7 +244,8 @@ def fit_flare(profile: ArmProfile, kernel: Plane) -> FlareFit:
         raise DataError(
             "flare-no-light",
             f"expected light of the flare at {MATCHED_PX[0]:g} to {MATCHED_PX[1]:g} px along the arm; "
-            f"got a mean difference of {level:.3g} over {int(matched.sum())} distances",
+            f"got a mean difference of {level:.3g} over {int(matched.sum())} distances: check the direction of the arm "
+            "and the image before the flare",
         )
     # Without noise, d_u is the error, but at least a tenth of the level: a value near 0 would dominate the fit.
     error = sigma if sigma is not None else np.maximum(observed, 0.1 * level)

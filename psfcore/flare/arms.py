@@ -194,7 +194,10 @@ def prepared(image: Plane, reference: Plane | None, saturated: Flags | None) -> 
         labels, _ = ndimage.label(saturated, structure=np.ones((3, 3)))
         patch = labels == np.bincount(labels.ravel())[1:].argmax() + 1
     if not usable.any():
-        raise DataError("all-masked", f"expected some usable pixels; got {usable.size} pixels, all masked")
+        raise DataError(
+            "all-masked",
+            f"expected some usable pixels; got {usable.size} pixels, all masked: use another image",
+        )
     return np.where(usable, difference, 0.0), usable, patch
 
 
@@ -224,7 +227,10 @@ def source_centre(
     peak = float(values.max())
     if not peak > middle + _FLARE_SIGMA * scatter:
         wanted = f"a spot at least {_FLARE_SIGMA:g} times the scatter ({scatter:.3g}) above the median ({middle:.3g})"
-        raise DataError("no-flare", f"expected a flare, {wanted}; got {peak:.3g} at the brightest pixel")
+        raise DataError(
+            "no-flare",
+            f"expected a flare, {wanted}; got {peak:.3g} at the brightest pixel: give its centre, or use another image",
+        )
     brightest = np.unravel_index(int(np.where(usable, smoothed, -np.inf).argmax()), smoothed.shape)
     return (float(brightest[1]), float(brightest[0])), radius
 

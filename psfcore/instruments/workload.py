@@ -99,7 +99,10 @@ def check_workload(instrument: Instrument, label: str) -> None:
             f"aperture.diameter_mm: expected a pattern that needs at most {MOST_SAMPLES} samples per pixel"
         )
         needs = "2 x diameter x pixel pitch / (wavelength x focal length)"
-        raise DataError("bad-instrument-file", f"{label}: {expected}; got {needs} = {largest.samples:.3g}")
+        raise DataError(
+            "bad-instrument-file",
+            f"{label}: {expected}; got {needs} = {largest.samples:.3g}: correct these quantities",
+        )
     if max(largest.cells, default=0) > MOST_CELLS:
         expected = f"meshes: expected at most {MOST_CELLS} cells along an axis of a rotated mesh"
         advice = "use fewer windows, a smaller pitch_um or a longer distance"

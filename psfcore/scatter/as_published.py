@@ -380,7 +380,7 @@ class _Recipe:
                 raise DataError(
                     "no-scatter",
                     f"round {n + 1}, {name}: expected scatter of less than 100 % of the light; got "
-                    f"{100 * (1 - centre):.3g} %",
+                    f"{100 * (1 - centre):.3g} %: fit without the published recipe (--as-published)",
                 )
             kernel = np.maximum(self.to_total.apply(crop_or_pad(scatter, self.psf_size)), 0.0)
             _check_brightest_at_centre(kernel, f"round {n + 1}: {name}")
@@ -491,7 +491,8 @@ def _check_brightest_at_centre(kernel: Kernel, label: str) -> None:
         raise DataError(
             "no-scatter",
             f"{label}: expected a PSF with its maximum at the centre; got {kernel[middle]:.3g} of the light there "
-            f"and {kernel.max():.3g} in a pixel at a distance of {distance:.3g} px",
+            f"and {kernel.max():.3g} in a pixel at a distance of {distance:.3g} px: fit without the published recipe "
+            "(--as-published)",
         )
 
 

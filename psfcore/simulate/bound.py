@@ -210,7 +210,8 @@ def _inverse(information: Plane) -> Plane:
     if not (np.isfinite(scale).all() and (scale > 0).all()):
         raise DataError(
             "no-bound",
-            "expected dark pixels that depend on every parameter; got a parameter that changes no dark pixel",
+            "expected dark pixels that depend on every parameter; got a parameter that changes no dark pixel: simulate "
+            "the transit with scatter (--total) and light",
         )
     correlation = information / np.outer(scale, scale)
     if np.linalg.cond(correlation) > 1 / np.finfo(np.float64).eps:

@@ -166,7 +166,9 @@ def scene_from_image(image: Plane, plan: Plan) -> Plane:
     are negative or not finite become 0. Raises DataError "bad-scene".
     """
     if image.ndim != 2 or min(image.shape) < 2:
-        raise DataError("bad-scene", f"expected a scene image with two axes; got shape {image.shape}")
+        raise DataError(
+            "bad-scene", f"expected a scene image with two axes of at least 2 px; got shape {image.shape}"
+        )
     light = np.maximum(np.nan_to_num(image.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0), 0.0)
     if light.max() <= 0:
         raise DataError(

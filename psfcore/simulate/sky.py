@@ -148,7 +148,8 @@ def _checked_scene(scenes: Mapping[int, Plane], pointing: int, plan: Plan) -> Pl
     if not np.isfinite(scene).all() or scene.min() < 0:
         raise DataError(
             "bad-scene",
-            f"expected finite pixels >= 0; got negative, NaN or infinite pixels in the scene of pointing {pointing}",
+            f"expected finite pixels >= 0; got negative, NaN or infinite pixels in the scene of pointing "
+            f"{pointing}: set them to 0",
         )
     return scene
 
@@ -156,11 +157,16 @@ def _checked_scene(scenes: Mapping[int, Plane], pointing: int, plan: Plan) -> Pl
 def _check_diffraction(diffraction: Kernel) -> None:
     if diffraction.ndim != 2 or not np.isfinite(diffraction).all() or diffraction.min() < -1e-12:
         raise DataError(
-            "bad-diffraction", f"expected finite weights [y, x] >= 0; got shape {diffraction.shape}"
+            "bad-diffraction",
+            f"expected finite weights [y, x] >= 0; got shape {diffraction.shape}, weights of "
+            f"{diffraction.min():.3g} to {diffraction.max():.3g}",
         )
     total = float(diffraction.sum())
     if abs(total - 1) > _SUM_TOLERANCE:
-        raise DataError("bad-diffraction", f"expected weights that sum to 1 on their grid; got {total:.6g}")
+        raise DataError(
+            "bad-diffraction",
+            f"expected weights that sum to 1 on their grid; got {total:.6g}: divide the weights by their sum",
+        )
 
 
 def covered_share(place: Place, first: tuple[int, int], shape: tuple[int, int], fine: int = 1) -> Plane:

@@ -215,7 +215,8 @@ def checked_kernel(kernel: Kernel, label: str) -> Kernel:
     if not np.isfinite(kernel).all():
         bad = int(np.count_nonzero(~np.isfinite(kernel)))
         raise DataError(
-            "known-psf-nonfinite", f"{label}: expected finite weights; got {bad} NaN or infinite ones"
+            "known-psf-nonfinite",
+            f"{label}: expected finite weights; got {bad} NaN or infinite ones: replace them, for example by 0",
         )
     smallest, largest = float(kernel.min()), float(kernel.max())
     if smallest < -_NEGATIVE_TOLERANCE * max(largest, 0.0):

@@ -90,7 +90,10 @@ class Member:
         if self._gate is not None:
             self._gate.count_unpacked(len(got))
         if self._read > self.size_bytes or (len(got) < count and self._read != self.size_bytes):
-            message = f"expected {self.size_bytes} bytes in {shown(self.name)}, as declared; got {self._read}"
+            message = (
+                f"expected {self.size_bytes} bytes in {shown(self.name)}, as declared; got {self._read}: pack or copy the "
+                "archive again"
+            )
             raise DataError("archive-broken", message)
         return got
 
@@ -170,7 +173,10 @@ class _BoundedFile:
     def read(self, count: int = -1) -> bytes:
         got = self._file.read(self._most + 1 if count < 0 else min(count, self._most + 1))
         if len(got) > self._most:
-            message = f"expected a table of contents of at most {self._most} bytes; got more"
+            message = (
+                f"expected a table of contents of at most {self._most} bytes; got more: pack fewer files, or shorten their "
+                "names"
+            )
             raise DataError("archive-too-large", message)
         if got.startswith(_ZIP_ENTRY):
             self._gate.check_members(got.count(_ZIP_ENTRY))
@@ -270,7 +276,10 @@ class _TarInput:
     def read(self, count: int) -> bytes:
         if self._header_bytes_left is not None:
             if not 0 <= count <= self._header_bytes_left:
-                message = f"expected at most {_MAX_HEADER_BYTES} bytes of headers for one member; got more"
+                message = (
+                    f"expected at most {_MAX_HEADER_BYTES} bytes of headers for one member; got more: pack the files again, "
+                    "for example as .zip"
+                )
                 raise DataError("archive-broken", message)
             self._header_bytes_left -= count
         got = self._counted(count)
@@ -297,10 +306,16 @@ def _check_pax_records(text: bytes) -> None:
         record = _PAX_RECORD.match(text, at)
         end = at + int(record[1]) if record else at
         if record is None or end <= record.end() or text[end - 1 : end] != b"\n":
-            raise DataError("archive-broken", "expected pax records 'length key=value'; got other text")
+            raise DataError(
+                "archive-broken",
+                "expected pax records 'length key=value'; got other text: pack or copy the archive again",
+            )
         at = end
     if _MANY_DIGITS.search(text):
-        raise DataError("archive-broken", "expected pax records with at most 64 digits in a row; got more")
+        raise DataError(
+            "archive-broken",
+            "expected pax records with at most 64 digits in a row; got more: pack the files again, for example as .zip",
+        )
 
 
 def _checked_headers(source: _TarInput, gate: Gate) -> type[tarfile.TarInfo]:
@@ -319,7 +334,9 @@ def _checked_headers(source: _TarInput, gate: Gate) -> type[tarfile.TarInfo]:
             try:
                 header = super().frombuf(buf, encoding, errors)
             except tarfile.HeaderError as error:
-                raise DataError("archive-broken", f"expected a tar header; got a {error}") from None
+                raise DataError(
+                    "archive-broken", f"expected a tar header; got a {error}: pack or copy the archive again"
+                ) from None
             if header.type == tarfile.GNUTYPE_SPARSE:
                 raise not_plain(header.name, "expected only plain files, no sparse ones")
             source.pax_text_is_next = header.type in _PAX_TYPES
@@ -344,7 +361,10 @@ def _tar_members(source: _TarInput, gate: Gate) -> Iterator[Member]:
                 return
             # Each member gets a copy of the global records.
             if len(archive.pax_headers) > _MAX_GLOBAL_RECORDS:
-                message = f"expected at most {_MAX_GLOBAL_RECORDS} global pax records; got more"
+                message = (
+                    f"expected at most {_MAX_GLOBAL_RECORDS} global pax records; got more: pack the files again, for "
+                    "example as .zip"
+                )
                 raise DataError("archive-broken", message)
             file = _admit_header(info, gate)
             info.pax_headers = {}  # to save memory, because tarfile keeps each TarInfo

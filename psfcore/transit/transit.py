@@ -83,7 +83,8 @@ class Frame:
             )
         if not np.isfinite(self.pixels).all():
             raise DataError(
-                "frame-nonfinite", f"{self.file}: expected finite pixels; got NaN or infinite ones"
+                "frame-nonfinite",
+                f"{self.file}: expected finite pixels; got NaN or infinite ones: fill them first",
             )
         if not (np.isfinite(self.exposure_s) and self.exposure_s > 0):
             raise DataError(
@@ -113,7 +114,10 @@ class Transit:
             raise DataError("transit-empty", "expected at least one image; got none")
         shapes = {frame.pixels.shape for frame in self.frames}
         if len(shapes) > 1:
-            raise DataError("transit-shapes", f"expected images of equal shape; got {sorted(shapes)}")
+            raise DataError(
+                "transit-shapes",
+                f"expected images of equal shape; got {sorted(shapes)}: cut all images to one size",
+            )
 
     @property
     def shape(self) -> tuple[int, int]:

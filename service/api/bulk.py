@@ -322,7 +322,7 @@ def retry_bulk(bulk_id: BulkId, caller: Bulk, state: Shared) -> BulkView:
     row = find(state, caller, bulk_id)
     with as_problems():
         changed = state.catalogue.bulks.retry(row.id)
-    _done(changed is not None, row, "other than CANCELLED")
+    _done(changed is not None, row, "other than CANCELLED", ": start a new one")
     state.reconciler.wake()
     return get_bulk(bulk_id, caller, state)
 

@@ -190,7 +190,9 @@ async def _append(request: Request, file: BinaryIO, upload: PartialUpload, take:
     try:
         async for chunk in request.stream():
             if file.tell() + len(chunk) > upload.length:
-                raise Problem(413, "too-large", f"expected {upload.length} bytes in all; got more")
+                raise Problem(
+                    413, "too-large", f"expected {upload.length} bytes in all; got more: start a new upload"
+                )
             if chunk:
                 await run_in_threadpool(take, len(chunk))
                 file.write(chunk)

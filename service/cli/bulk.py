@@ -120,7 +120,9 @@ def submit(
         )
     uploaded, refused = _upload(service, fits_files(uploads))
     if refused and not (uploaded or images or patterns):
-        raise click.ClickException("no file could be uploaded, so no bulk run was started")
+        raise click.ClickException(
+            "no file could be uploaded, so no bulk run was started; the reasons are listed above"
+        )
     psf_id = named_psf(service, psf)
     if psf_id is not None and service.psf(psf_id)["status"] == PsfStatus.DEPRECATED:
         echo(f"warning: PSF {short(psf_id)} was deprecated; every product has this warning", err=True)

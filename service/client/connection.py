@@ -245,7 +245,11 @@ def _raise_if_refused(response: httpx.Response) -> None:
         return
     status = response.status_code
     if not response.headers.get("content-type", "").startswith("application/problem+json"):
-        raise ServiceError(f"the service answered {status}", status=status)
+        raise ServiceError(
+            f"expected an answer of heliopsf; got status {status} in another form: check the address of the service, "
+            "and the proxy before it",
+            status=status,
+        )
     response.read()
     problem = response.json()
     after = response.headers.get("retry-after", "")

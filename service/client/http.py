@@ -137,7 +137,9 @@ class Client(Connection, Operations):
             while job["phase"] in ("QUEUED", "EXECUTING"):
                 waited_s = time.monotonic() - started
                 if timeout_s is not None and waited_s > timeout_s:
-                    raise TimeoutError(f"job {job['id']} is {job['phase']} after {timeout_s:g} s")
+                    raise TimeoutError(
+                        f"job {job['id']} is {job['phase']} after {timeout_s:g} s and continues: wait for it again"
+                    )
                 if job["phase"] == "QUEUED" and waited_s > QUEUED_S and not in_queue_said:
                     self.say(f"job {job['id'][:SHOWN_DIGITS]} waits in the queue {job['queue']}")
                     in_queue_said = True

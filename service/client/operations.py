@@ -245,11 +245,16 @@ class Operations(ABC):
     def _ended(job: dict[str, Any]) -> dict[str, Any]:
         """The job, if it is completed. Raises ``ServiceError`` if it failed, was cancelled or was never started."""
         if job["phase"] == "PENDING":
-            raise ServiceError(f"job {job['id']} was created but not started", code="pending")
+            raise ServiceError(
+                f"job {job['id']} was created but not started: start it with PHASE=RUN at /uws/jobs/{job['id']}/phase",
+                code="pending",
+            )
         if job["phase"] == "ERROR":
             raise ServiceError(job["error"]["message"], code=job["error"]["code"])
         if job["phase"] == "ABORTED":
-            raise ServiceError(f"job {job['id']} was cancelled", code="cancelled")
+            raise ServiceError(
+                f"job {job['id']} was cancelled: submit it again if you need its result", code="cancelled"
+            )
         return job
 
 

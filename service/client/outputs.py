@@ -120,7 +120,7 @@ def _check_writable(output: Path) -> None:
         if target.is_dir():
             raise IsADirectoryError(None, "expected a file; this is a folder")
         if not target.parent.is_dir():
-            raise NotADirectoryError(None, f"there is no folder {target.parent}")
+            raise NotADirectoryError(None, f"there is no folder {target.parent}: make it first")
         probe(target)
 
 

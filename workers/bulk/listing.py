@@ -185,6 +185,9 @@ def _path_error(path: Path, source: str) -> DataError | None:
         message = f"expected a path in UTF-8; got a path that ends in {source[-100:]}: rename the file"
         return DataError(NOT_UTF_8, message)
     if len(source) > MOST_LETTERS:
-        message = f"expected a path of at most {MOST_LETTERS} characters; got {len(source)}, ending in {source[-100:]}"
+        message = (
+            f"expected a path of at most {MOST_LETTERS} characters; got {len(source)}, ending in {source[-100:]}: use "
+            "shorter names"
+        )
         return DataError(TOO_LONG, message)
     return None

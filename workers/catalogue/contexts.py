@@ -300,7 +300,10 @@ def _pins_of_all(session: Session, owner: str) -> list[PsfPinRow]:
 
 def _pins_of(session: Session, owner: str, pins: Sequence[Pin]) -> list[PsfPinRow]:
     if not pins:
-        raise DataError("nothing-to-pin", "expected at least one PSF to pin; got an empty list")
+        raise DataError(
+            "nothing-to-pin",
+            "expected at least one PSF to pin; got an empty list: name PSFs, or leave out the list to pin all certified PSFs",
+        )
     rows = [_pin(existing_psf(session, pin.psf_id, owner), pin.validity) for pin in pins]
     rows.sort(key=lambda pinned: (pinned.series, pinned.valid_from))
     for one, other in pairwise(rows):
@@ -309,7 +312,7 @@ def _pins_of(session: Session, owner: str, pins: Sequence[Pin]) -> list[PsfPinRo
             raise DataError(
                 "ranges-overlap",
                 f"expected at most one PSF of {one.series} for any time; the ranges of PSF {one.psf_id}, {first}, and PSF "
-                f"{other.psf_id}, {second}, overlap",
+                f"{other.psf_id}, {second}, overlap: leave one out, or pin it with a narrower range (valid_from, valid_to)",
             )
     return rows
 

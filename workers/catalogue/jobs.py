@@ -255,7 +255,8 @@ class Jobs(Queries):
         error = JobError(
             fault=Fault.INTERNAL,
             code="worker-lost",
-            message=f"the worker was lost {max_attempts} times while it ran this job; the job is not tried again",
+            message=f"the worker was lost {max_attempts} times while it ran this job; the job is not tried again: tell "
+            "the operator",
         )
         ended = {
             "phase": Phase.ERROR,

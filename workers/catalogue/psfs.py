@@ -249,7 +249,7 @@ def _series(row: PsfRow, asked: StatusAsked) -> tuple[str, dict[str, Any]]:
         if value is not None and not (name == "channel" and draft and is_variant_of(new, value)):
             raise DataError(
                 "line-known",
-                f"{name}: expected {value!r}, which PSF {row.id} has and which cannot change; got {new!r}",
+                f"{name}: expected {value!r}, which PSF {row.id} has and which cannot change; got {new!r}: leave it out",
             )
         columns[name] = new
     kind = columns["kind"] or row.kind
@@ -270,7 +270,8 @@ def _certify(session: Session, row: PsfRow, columns: dict[str, Any], asked: Stat
     elif asked.version not in (None, row.version):
         raise DataError(
             "not-of-this-change",
-            f"expected version {row.version}, because the version of a certified PSF cannot change; got {asked.version}",
+            f"expected version {row.version}, because the version of a certified PSF cannot change; got {asked.version}: "
+            "leave it out",
         )
     validity = asked.validity or validity_of(row)
     for superseded_id in asked.supersedes:
@@ -282,7 +283,8 @@ def _certify(session: Session, row: PsfRow, columns: dict[str, Any], asked: Stat
             or superseded.status != PsfStatus.CERTIFIED
         ):
             raise DataError(
-                "not-to-supersede", f"supersedes: expected certified PSFs of {series}; got {superseded_id}"
+                "not-to-supersede",
+                f"supersedes: expected certified PSFs of {series}; got {superseded_id}: leave it out",
             )
         _write(session, superseded, asked.reason, by, status=PsfStatus.DEPRECATED, successor_id=row.id)
         _deprecate_interpolated(session, superseded, asked.reason, by)

@@ -82,7 +82,11 @@ def check_under(path: Path, allowed: Sequence[Path], what: str = "a path") -> Pa
         return resolved
     none = "a folder that the operator allows (no folder is set in HELIOPSF_BULK_ROOTS, HELIOPSF_BULK_OUTPUT_ROOTS)"
     where = ", ".join(map(str, allowed)) or none
-    raise DataError("path-not-allowed", f"expected {what} below {where}; got {ascii(str(path))[:200]}")
+    message = (
+        f"expected {what} below {where}; got {ascii(str(path))[:200]}: use another path, or ask the operator to allow "
+        "its folder"
+    )
+    raise DataError("path-not-allowed", message)
 
 
 def check_glob(glob: str, allowed: Sequence[Path]) -> None:
@@ -119,7 +123,8 @@ def copy_hashed(file: BinaryIO, target: Path, max_bytes: int) -> str:
             size += len(chunk)
             if size > max_bytes:
                 raise DataError(
-                    "too-large", f"expected a file of at most {max_bytes} bytes; got a larger one"
+                    "too-large",
+                    f"expected a file of at most {max_bytes} bytes; got a larger one: ask the operator for a higher limit",
                 )
             digest.update(chunk)
             copy.write(chunk)

@@ -152,7 +152,8 @@ def look_for_image(
         raise DataError(
             "no-date",
             f"expected DATE-BEG or DATE-OBS in the image's header, in the form 2024-03-01T12:00:00, because PSFs of "
-            f"{series_of(instrument, channel, kind)} are valid only for some times; got {header['date_obs']!r}",
+            f"{series_of(instrument, channel, kind)} are valid only for some times; got {header['date_obs']!r}: "
+            "name the PSF in the request",
         )
     if at is None or found.psfs or kind != TOTAL:
         return found

@@ -370,7 +370,7 @@ def test_paths_that_cannot_be_stored(catalogue: Catalogue, settings: Settings, t
     assert failed["unreadable-file"].source == str(root / "loop.fits")
     assert failed["path-too-long"].source == f"{str(long)[:1023]}…"
     message = failed["path-too-long"].error["message"]  # type: ignore[index]
-    assert "1024" in message and str(len(str(long))) in message and message.endswith("5/long.fits")
+    assert "1024" in message and str(len(str(long))) in message and "5/long.fits: " in message
     sources = [item.source for item in items]
     assert f"{root}/\\xff\\xfe/Sonne\\xf6.fits" in sources
     assert max(map(len, sources)) == listing.MOST_LETTERS == BulkItemRow.__table__.c.source.type.length  # type: ignore[attr-defined]
