@@ -19,6 +19,7 @@ result does not depend on the number of threads.
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
 import queue
@@ -80,7 +81,6 @@ class Engine:
         threads: int = 1,
     ) -> None:
         self.field_shape = field_shape
-        self.threads = threads
         span = span or field_shape
         kernel, first = needed_kernel(psf_kernel, span)
         ly, lx = (
@@ -92,12 +92,23 @@ class Engine:
         self.row_blocks = -(-ny // BLOCK_ROWS)
         self.column_blocks = -(-(lx // 2 + 1) // LANES)
         self.lanes_shape = (self.row_blocks, nx, 2, LANES)
+        self._use_threads(threads)
+        self.transfer = self._transfer_function(kernel, first)
+
+    def _use_threads(self, threads: int) -> None:
+        self.threads = threads
         self._pool = ThreadPoolExecutor(max(threads - 1, 1))
         self._scratch: queue.SimpleQueue[Scratch] = queue.SimpleQueue()
         for _ in range(threads):
-            buffer = aligned(max(lx, ly) * 2 * LANES)
+            buffer = aligned(max(self.row_plan.length, self.column_plan.length) * 2 * LANES)
             self._scratch.put(Scratch(buffer, aligned(LANES, 4, LANES)))
-        self.transfer = self._transfer_function(kernel, first)
+
+    def twin(self) -> Engine:
+        """The same operator with one thread and its own working memory: another thread may use it beside this one."""
+        twin = copy.copy(self)
+        twin.release()
+        twin._use_threads(1)
+        return twin
 
     @cached_property
     def _spectrum(self) -> Single:

@@ -52,6 +52,7 @@ from psfcore.scatter.reconstruction import (
     Round,
     Solution,
     TransitScenes,
+    on_threads,
 )
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Shape, Vector
 from psfcore.scatter.total_psf import Blur, Kernel, Optics, TotalPsf, noise_covariance
@@ -225,6 +226,14 @@ class _Model:
     curve: Vector
     curve_slopes: NDArray[np.float64]
 
+    def twins(self) -> list[_Model]:
+        """The same for each thread, see `on_threads`."""
+        blurs = [blur.twins() for blur in self.slope_blurs]
+        return [
+            replace(self, images=images, slope_blurs=[of_all[k] for of_all in blurs])
+            for k, images in enumerate(self.images.twins())
+        ]
+
 
 class _Solver:
     """Gauss-Newton steps on Eq. (2)."""
@@ -324,11 +333,14 @@ class _Solver:
         )
 
     def _measure(self, model: _Model, frames: list[int], kept: dict[int, _Measured]) -> dict[int, _Measured]:
-        measured = {}
-        for step, n in enumerate(frames):
-            self._progress(f"round {len(self.rounds) + 1}", step, len(frames))
-            measured[n] = self._measure_one(model, n, kept.get(n))
-        return measured
+        def one(model: _Model, n: int) -> _Measured:
+            return self._measure_one(model, n, kept.get(n))
+
+        stage = f"round {len(self.rounds) + 1}"
+        results = on_threads(
+            one, frames, model.twins(), lambda step: self._progress(stage, step, len(frames))
+        )
+        return dict(zip(frames, results, strict=True))
 
     def _measure_one(self, model: _Model, n: int, kept: _Measured | None) -> _Measured:
         """Compute Eq. (1) for one image. If `kept` is given, reuse its weights and Jacobian; otherwise compute Eq. (3) and (4)."""
@@ -350,12 +362,21 @@ class _Solver:
         normal = self._normal(measured)
         spread = np.zeros_like(normal)
         fits = []
-        for step, (n, m) in enumerate(measured.items()):
-            self._progress("errors", step, len(measured))
+
+        def covariance_of(optics: Optics, n: int) -> NDArray[np.float64]:
             frame, dark, noise = self._sky.transit.frames[n], self._sky.dark[n], self._sky.transit.noise
-            templates = [*m.weighted, np.full(dark[0].size, 1 / dark[0].size)]
+            templates = [*measured[n].weighted, np.full(dark[0].size, 1 / dark[0].size)]
             # The covariance of the score, and in the last row that of the mean residual, from the noise of all pixels.
-            of_noise = noise_covariance(model.images.optics, frame, dark, templates, noise)
+            return noise_covariance(optics, frame, dark, templates, noise)
+
+        covariances = on_threads(
+            covariance_of,
+            frames,
+            model.images.optics.twins(),
+            lambda step: self._progress("errors", step, len(frames)),
+        )
+        for (n, m), of_noise in zip(measured.items(), covariances, strict=True):
+            frame, dark = self._sky.transit.frames[n], self._sky.dark[n]
             spread += self._counts[n] ** 2 * of_noise[:-1, :-1]
             fits.append(
                 FrameFit(

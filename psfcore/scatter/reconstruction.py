@@ -6,9 +6,12 @@ The equations and the symbols are those of `psfcore.scatter.inversion`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from queue import SimpleQueue
+from typing import Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +22,8 @@ from psfcore.transit.occulter import LARGEST_SHIFT_PX, FoundPlace, find_occulter
 from psfcore.transit.transit import Frame, Transit
 
 Progress = Callable[[str, int, int], None]
+Tool = TypeVar("Tool")
+Result = TypeVar("Result")
 
 DARK_MARGIN_PX = 0.05
 DARK_MARGIN_SIGMAS = 1.5
@@ -32,6 +37,40 @@ SCENES_KEPT = 13
 def labelled(progress: Progress, label: str) -> Progress:
     """The same progress function; the names of the stages begin with a label."""
     return lambda stage, step, steps: progress(f"{label}: {stage}", step, steps)
+
+
+def on_threads(
+    work: Callable[[Tool, int], Result],
+    numbers: Sequence[int],
+    tools: Sequence[Tool],
+    told: Callable[[int], object],
+) -> list[Result]:
+    """work(tool, n) for each number, on as many threads as there are tools; no two threads use a tool at the same time.
+
+    Images are computed beside each other, because one image keeps several threads busy only in its transforms. told(step) is
+    called before each result is waited for; if it raises an exception, the images that are left are not computed.
+    """
+    free: SimpleQueue[Tool] = SimpleQueue()
+    for tool in tools:
+        free.put(tool)
+
+    def one(n: int) -> Result:
+        tool = free.get()
+        try:
+            return work(tool, n)
+        finally:
+            free.put(tool)
+
+    pool = ThreadPoolExecutor(len(tools))
+    try:
+        pending = pool.map(one, numbers) if len(tools) > 1 else map(one, numbers)
+        results = []
+        for step in range(len(numbers)):
+            told(step)
+            results.append(next(pending))
+        return results
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 @dataclass(eq=False)
@@ -50,11 +89,15 @@ class TransitScenes:
     @classmethod
     def reconstructed(cls, transit: Transit, optics: Optics, progress: Progress) -> TransitScenes:
         """Step (d): the scenes of all images; no occulter is located yet."""
-        sky = cls(transit, [])
-        for n, frame in enumerate(transit.frames):
-            progress("reconstructing", n, len(transit.frames))
-            sky.scenes.append(optics.invert(optics.lanes(frame.pixels)))
-        return sky
+
+        def scene(optics: Optics, n: int) -> Lanes:
+            return optics.invert(optics.lanes(transit.frames[n].pixels))
+
+        every = range(len(transit.frames))
+        scenes = on_threads(
+            scene, every, optics.twins(), lambda step: progress("reconstructing", step, len(every))
+        )
+        return cls(transit, scenes)
 
     def improve(self, n: int, optics: Optics, steps: int) -> None:
         """Step (d) again: continue from the scene of image n for some steps."""
@@ -138,6 +181,10 @@ class Reconstruction:
         scene = self.sky.scenes[n].copy()
         put(scene, self.sky.dark[n], 0.0)
         return scene
+
+    def twins(self) -> list[Self]:
+        """The same for each thread, see `on_threads`."""
+        return [replace(self, optics=optics) for optics in self.optics.twins()]
 
     def residual(self, n: int) -> tuple[Vector, Vector]:
         """Observed minus expected intensity of the dark pixels of image n, r of Eq. (1), and the expected intensity, DN/s."""

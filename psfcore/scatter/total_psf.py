@@ -39,8 +39,10 @@ which the model scatters into the disc.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from typing import Self
 
 import numpy as np
 from astropy.io.fits import Header
@@ -63,6 +65,7 @@ DIFFRACTION, SCATTER = "DIFFRACTION", "SCATTER"
 Lanes = NDArray[np.float32]
 Pixels = tuple[NDArray[np.intp], NDArray[np.intp]]  # (rows, columns) of single pixels
 STEPS = 5
+BLOCK_PX = 2**18  # of sums over all pixels: arrays of this size need little memory
 
 
 class TotalPsf:
@@ -166,6 +169,15 @@ class Blur:
         self.engine = Engine(kernel, field_shape, threads=threads)
         self._partly_filled = field_shape[0] % BLOCK_ROWS != 0
 
+    def twins(self) -> list[Self]:
+        """The same operator for each thread, see `Engine.twin`."""
+        if self.engine.threads == 1:
+            return [self]
+        twins = [copy.copy(self) for _ in range(self.engine.threads)]
+        for twin in twins:
+            twin.engine = self.engine.twin()
+        return twins
+
     def lanes(self, field: NDArray[np.floating]) -> Lanes:
         """A field [y, x] rearranged into the engine's order."""
         return self.engine.to_lanes(field)
@@ -232,16 +244,20 @@ def noise_covariance(
     optics: Optics, frame: Frame, dark: Pixels, templates: Sequence[NDArray[np.float64]], noise: Noise
 ) -> NDArray[np.float64]:
     """Eq. (4): covariance (templates, templates) of the weighted sums over the dark pixels, in (DN/s)^2."""
-    spread = []
-    for template in templates:
+    b = np.empty((len(templates), frame.pixels.size), dtype=np.float32)
+    for row, template in zip(b, templates, strict=True):
         here = np.zeros(optics.engine.lanes_shape, np.float32)
         put(here, dark, template)
         scattered = optics.correlate(here)
         put(scattered, dark, 0.0)
         here -= optics.invert_once(scattered, adjoint=True)  # Eq. (3)
-        spread.append(optics.field(here).ravel())
-    b = np.array(spread, dtype=np.float32)
-    # The variance is a linear function of the expected pixel value. The observed value can replace the expected value
-    # here, because the noise of the observed values averages out in the sum over the pixels.
-    variance = noise.variance(frame.pixels.astype(np.float64), frame.exposure_s).ravel()
-    return np.asarray((b * variance.astype(np.float32)) @ b.T, dtype=np.float64)  # Eq. (4)
+        row[:] = optics.field(here).ravel()
+    covariance = np.zeros((len(templates), len(templates)))
+    observed = frame.pixels.ravel()
+    for first in range(0, observed.size, BLOCK_PX):
+        part = b[:, first : first + BLOCK_PX]
+        # The variance is a linear function of the expected pixel value. The observed value can replace the expected value
+        # here, because the noise of the observed values averages out in the sum over the pixels.
+        variance = noise.variance(observed[first : first + BLOCK_PX].astype(np.float64), frame.exposure_s)
+        covariance += (part * variance.astype(np.float32)) @ part.T  # Eq. (4)
+    return covariance

@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 from psfcore.errors import DataError
 from psfcore.psf import REACH_GRID_PX, cumulative_curve, radial_profile
 from psfcore.scatter.inversion import invert
-from psfcore.scatter.reconstruction import Inversion, Progress, Solution, labelled
+from psfcore.scatter.reconstruction import Inversion, Progress, Solution, labelled, on_threads
 from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW, Shape, Vector
 from psfcore.scatter.total_psf import Blur, TotalPsf
 from psfcore.transit.transit import Transit, folds
@@ -182,15 +182,20 @@ def compare_shapes(
                 names.append(parameter.name)
                 slope = total.slope(shape.coordinates(at.values), k)
                 blurs.append(Blur(slope, field_shape, threads=threads))
-    normals, scores = [], []
-    for step, n in enumerate(solution.part):
-        progress("comparing shapes", step, len(solution.part))
+
+    def equations(tool: tuple[Solution, list[Blur]], n: int) -> tuple[Matrix, Matrix]:
+        solution, blurs = tool
         residual, expected = solution.residual(n)
         jacobian = np.array([solution.jacobian(n, blur) for blur in blurs])
         weighted = jacobian * solution.weight(n, expected)
-        normals.append(weighted @ jacobian.T)
-        scores.append(weighted @ residual)
-    normal, score = np.array(normals), np.array(scores)
+        return weighted @ jacobian.T, weighted @ residual
+
+    tools = list(zip(solution.twins(), map(list, zip(*(b.twins() for b in blurs), strict=True)), strict=True))
+    count = len(solution.part)
+    found = on_threads(
+        equations, solution.part, tools, lambda step: progress("comparing shapes", step, count)
+    )
+    normal, score = (np.array(part) for part in zip(*found, strict=True))
     added = [[BASE + names.index(name) for name in shape.names[BASE:]] for shape in shapes]
     return tuple(_compared(shape, of, normal, score) for shape, of in zip(shapes, added, strict=True))
 
