@@ -65,7 +65,7 @@ FOR_ALL = (401, 403)
     required=True,
     type=OutputPlace(decides=True),
     metavar="FILE|FOLDER/",
-    help="Write the product (FITS) to this file, or the products of several images into this folder",
+    help="File of the product (FITS), or folder for the products of several images",
 )
 @PSF
 @options_of(Deconvolve, *OPTIONS)
