@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import time
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from psfcore.errors import DataError
 from psfcore.noise import Noise
 from psfcore.scatter.inversion import PILOT_FRAMES, invert
-from psfcore.scatter.reconstruction import LEAST_DARK_PIXELS, Inversion, Solution, dark_pixels
+from psfcore.scatter.reconstruction import LEAST_DARK_PIXELS, Inversion, Solution, dark_pixels, on_threads
 from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW, stretch_of
 from psfcore.scatter.total_psf import Blur, Optics, pick, put
 from psfcore.simulate.bound import bound_of_sky
@@ -141,6 +142,22 @@ def test_threads_change_nothing_and_progress_tells_stages() -> None:
     np.testing.assert_allclose(two.curve_sigma, one.curve_sigma, rtol=1e-4)
     assert {stage.split()[0] for stage, _, _ in seen} == {"reconstructing", "round", "errors"}
     assert all(0 <= step < steps == IMAGES for _, step, steps in seen)
+
+
+def test_no_further_image_is_computed_when_a_fit_is_stopped() -> None:
+    computed: list[int] = []
+
+    def work(_tool: str, n: int) -> None:
+        computed.append(n)
+        time.sleep(0.01)
+
+    def told(step: int) -> None:
+        if step == 2:
+            raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        on_threads(work, range(1000), ["one", "other"], told)
+    assert len(computed) < 500
 
 
 def test_the_solution_is_a_minimum() -> None:
