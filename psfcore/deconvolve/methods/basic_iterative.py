@@ -5,7 +5,7 @@
 The paper recommends this method for a bright source near an edge. Eq. (1) converges to H x = y even if H moves light
 out of the field. The method therefore restores the part of a pixel's light that falls outside the field. The method
 must also take account of the light that enters from outside. If the scene is assumed to be zero beyond the field, the
-pixels along the edge become a third too bright (`python -m studies.methods edges`). Therefore, by default, the mirror image of
+pixels along the edge become a third too bright (measured with simulated scenes). Therefore, by default, the mirror image of
 the field continues the scene beyond the field. If the field is much smaller than the PSF, the margin makes it possible
 to use the whole PSF.
 

@@ -17,7 +17,7 @@ One plane stores the light (at least 0) of the trusted pixels, and -a for the ma
 
 In the paper the scene is zero beyond the field (edges "zero"). In this case, the outermost rows of the result become 4
 to 6 % too dark: light that enters from beyond the field replaces the light that leaves the field, but only on average.
-If the mirror image of the field continues the scene, the error is at most 1.3 % (`python -m studies.methods edges`). The
+If the mirror image of the field continues the scene, the error is at most 1.3 % (measured with simulated scenes). The
 default is therefore "symmetric". A margin of about 64 px is enough, because the published step compensates for the
 light that crosses the edge of the margin.
 

@@ -1,4 +1,4 @@
-"""The studies of the calibration and of the limits: what they ask of an answer, what they fit and add, and their tables."""
+"""The study of the calibration: the share of the true cause, and the temperature that it fits."""
 
 from __future__ import annotations
 
