@@ -64,7 +64,7 @@ def _beyond_field(view: View) -> Sequence[Change]:
 
 
 def _coarse(plane: NDArray[np.floating]) -> NDArray[np.float64]:
-    """The means of a plane over squares of COARSE_PX px. Repeated edge pixels complete incomplete squares."""
+    """The means of a plane over squares of COARSE_PX px. Squares that reach beyond the edge are filled with the pixels of the edge."""
     ny, nx = plane.shape
     return block_means(np.pad(plane, ((0, -ny % COARSE_PX), (0, -nx % COARSE_PX)), mode="edge"), COARSE_PX)
 
