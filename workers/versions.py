@@ -146,7 +146,10 @@ def check_transition(before: PsfStatus, after: PsfStatus) -> None:
     """Raise ``DataError`` "wrong-transition" if the status may not change in this way."""
     if after not in MAY_BECOME[before]:
         allowed = " or ".join(sorted(MAY_BECOME[before]))
-        raise DataError("wrong-transition", f"expected status {allowed} for a {before} PSF; got {after}")
+        advice = ": certify another PSF in its place" if before == PsfStatus.DEPRECATED else ""
+        raise DataError(
+            "wrong-transition", f"expected status {allowed} for a {before} PSF; got {after}{advice}"
+        )
 
 
 def next_version(released: Iterable[str]) -> str:

@@ -77,9 +77,14 @@ class Frame:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "pixels", np.ascontiguousarray(self.pixels, dtype=np.float32))
-        if self.pixels.ndim != 2 or (self.filled is not None and self.filled.shape != self.pixels.shape):
+        if self.pixels.ndim != 2:
             raise DataError(
                 "frame-shape", f"{self.file}: expected pixels with two axes; got shape {self.pixels.shape}"
+            )
+        if self.filled is not None and self.filled.shape != self.pixels.shape:
+            raise DataError(
+                "frame-shape",
+                f"{self.file}: expected a plane `filled` of the shape {self.pixels.shape} of the pixels; got {self.filled.shape}",
             )
         if not np.isfinite(self.pixels).all():
             raise DataError(

@@ -169,7 +169,8 @@ def sigma_points(mean: NDArray[np.float64], covariance: NDArray[np.float64]) -> 
     count = len(mean)
     problem = f"expected a symmetric covariance of {count} x {count} without negative eigenvalues"
     if covariance.shape != (count, count) or not np.allclose(covariance, covariance.T):
-        raise DataError("bad-covariance", f"{problem}; got shape {covariance.shape}")
+        got = "an asymmetric one" if covariance.shape == (count, count) else f"shape {covariance.shape}"
+        raise DataError("bad-covariance", f"{problem}; got {got}")
     values, vectors = np.linalg.eigh(covariance)
     if values.min() < -1e-10 * max(values.max(), 0.0):
         raise DataError("bad-covariance", f"{problem}; the smallest eigenvalue is {values.min():.3g}")
