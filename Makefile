@@ -42,7 +42,7 @@ browser:
 test-full: $(DEV)
 	$(BIN)/python -m pytest -n 2 --dist loadfile tests
 
-# Each figure beside its goal and the stored one; needs an hour and no other program on the machine.
+# Each figure beside its goal and the stored one; needs 20 minutes and no other program on the machine.
 bench: $(DEV)
 	$(BIN)/python -m benchmarks
 
