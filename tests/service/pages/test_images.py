@@ -62,25 +62,6 @@ def test_an_image_without_a_psf_is_told_so(api: TestClient, tmp_path: Path) -> N
     assert f'action="/psfs?image={xrt}"' in page, "a PSF is uploaded here"
 
 
-def test_the_psf_of_another_channel_is_refused_before_a_job(
-    api: TestClient, psf_file: Path, tmp_path: Path
-) -> None:
-    aia = image(api, tmp_path, **{**AIA, "WAVELNTH": 193})
-    psf = api.post("/v1/psfs?instrument=aia_171&channel=171", content=psf_file.read_bytes()).json()["id"]
-    first, last = checked(api, aia, psf_id=psf)
-    assert "the image is of aia_193, the PSF of aia_171" in first and "allow it below" in last
-    assert checked(api, aia, psf_id=psf, other_channel="1")[0].endswith("You chose this PSF.")
-
-
-def test_the_advice_is_that_of_the_error(api: TestClient, psf_file: Path, tmp_path: Path) -> None:
-    product = image(api, tmp_path, PSFID="0" * 64)
-    psf = upload(api, psf_file, "/v1/psfs")
-    first, last = checked(api, product, psf_id=psf)
-    assert "the card PSFID" in first and "allow it below" in last
-    page = api.get(f"/images/{product}?psf_id={psf}").text
-    assert "What you can do" not in page and "Upload a PSF" not in page
-
-
 def test_an_error_plane_needs_no_figures_and_the_form_takes_them(api: TestClient, tmp_path: Path) -> None:
     hri = image(api, tmp_path, **HRI)
     assert checked(api, hri, error_draws="8")[0].startswith("PSF hri_euv 0.2.0, built for")
