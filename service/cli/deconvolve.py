@@ -14,7 +14,7 @@ import click
 from psfcore.deconvolve.summary import summary_lines
 from psfcore.errors import DataError
 from psfcore.files import sha256_of
-from service.cli.connection import LOCAL, PSF, SERVER, connection, named_psf, short
+from service.cli.connection import PSF, SERVER_OR_LOCAL, connection, named_psf, short
 from service.cli.options import (
     DRAWN,
     OUTPUT_FOLDER,
@@ -72,8 +72,7 @@ FOR_ALL = (401, 403)
 @click.option("--plot", type=DRAWN, help="Write the image before and after (PNG)")
 @click.option("--changes", type=DRAWN, help="Write difference, ratio and histograms (PNG)")
 @click.option("--timings", is_flag=True, help="Print how long each stage took; needs --local")
-@SERVER
-@LOCAL
+@SERVER_OR_LOCAL
 @writes_files
 def deconvolve(
     images: tuple[Path, ...],
@@ -197,8 +196,7 @@ def _many(
 @PSF
 @options_of(Deconvolve, "other_channel", "context", "method", "steps", "noise", "saturation_dn", "again")
 @click.option("--most", default=60, type=click.IntRange(1, 200), help="Images on the contact sheet")
-@SERVER
-@LOCAL
+@SERVER_OR_LOCAL
 @OVERWRITE
 def changes(
     images: tuple[Path, ...],

@@ -358,16 +358,10 @@ def check_fresh_folder(folder: Path, inputs: Sequence[Path] = (), *, overwrite: 
 
 def write_json(path: Path | None, content: dict[str, Any], *, overwrite: bool = False) -> None:
     """Write ``content`` to ``path``, if a path is given. Raises ``ClickException`` if the file cannot be written."""
-    if path is None:
-        return
-    text = json.dumps(content, indent=1, allow_nan=False) + "\n"
-    try:
-        with written(path, overwrite=overwrite) as partial:
+    if path is not None:
+        text = json.dumps(content, indent=1, allow_nan=False) + "\n"
+        with user_errors(), written(path, overwrite=overwrite) as partial:
             partial.write_text(text, "utf-8")
-    except ServiceError as error:
-        raise click.ClickException(str(error)) from error
-    except OSError as error:
-        raise click.ClickException(f"cannot write {path}: {error.strerror or error}") from error
 
 
 def fits_files(paths: Sequence[Path]) -> list[Path]:

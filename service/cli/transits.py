@@ -17,7 +17,7 @@ from typing import Any
 import click
 
 from psfcore.errors import DataError
-from service.cli.connection import LOCAL, SERVER, connection, named_psf, psf_option
+from service.cli.connection import SERVER_OR_LOCAL, connection, named_psf, psf_option
 from service.cli.options import (
     DRAWN,
     FILE,
@@ -82,8 +82,7 @@ def _reporting(
 @PLOT
 @psf_option("PSF to test: an id or a file [default: fit a PSF to TRANSIT]")
 @options_of(Report, "dark_offsets", "shapes", "seed", "noise", "saturation_dn")
-@SERVER
-@LOCAL
+@SERVER_OR_LOCAL
 @writes_files
 def report(
     transit: Path,
@@ -174,8 +173,7 @@ def gap() -> None:
     help="Also test the effects in these files, whose code is executed. Only with --local; in a service set HELIOPSF_GAP_EFFECTS",
 )
 @options_of(GapDiagnose, "coverage", "seed", "noise", "saturation_dn")
-@SERVER
-@LOCAL
+@SERVER_OR_LOCAL
 @writes_files
 def diagnose(
     transit: Path,
