@@ -18,8 +18,8 @@ from service.cli.connection import PSF, SERVER_OR_LOCAL, connection, named_psf, 
 from service.cli.options import (
     DRAWN,
     OUTPUT_FOLDER,
+    OUTPUT_PLACE,
     OVERWRITE,
-    OutputPlace,
     Place,
     counted,
     fits_files,
@@ -30,7 +30,6 @@ from service.cli.options import (
     say_warnings,
     user_errors,
     write_json,
-    writes_files,
 )
 from service.cli.progress import Report, echo
 from service.client.errors import ServiceError
@@ -63,7 +62,7 @@ FOR_ALL = (401, 403)
     "-o",
     "--output",
     required=True,
-    type=OutputPlace(decides=True),
+    type=OUTPUT_PLACE,
     metavar="FILE|FOLDER/",
     help="File of the product (FITS), or folder for the products of several images",
 )
@@ -73,7 +72,7 @@ FOR_ALL = (401, 403)
 @click.option("--changes", type=DRAWN, help="Write difference, ratio and histograms (PNG)")
 @click.option("--timings", is_flag=True, help="Print how long each stage took; needs --local")
 @SERVER_OR_LOCAL
-@writes_files
+@OVERWRITE
 def deconvolve(
     images: tuple[Path, ...],
     output: Place,

@@ -198,14 +198,7 @@ class OutputFolder(_Output):
 
 
 class OutputPlace(OutputFile):
-    """The type of an option that names a file to write, or a folder in which the command chooses the file name.
-
-    decides: the command itself decides whether the path is a folder, and checks the path.
-    """
-
-    def __init__(self, *, decides: bool = False) -> None:
-        super().__init__()
-        self.decides = decides
+    """The type of an option that names a file to write, or a folder in which the command chooses the file name."""
 
     def convert(  # type: ignore[override]
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
@@ -325,8 +318,6 @@ def _files_of(
     inputs: list[Path] = []
     for parameter in parameters:
         value = given.get(parameter.name or "")
-        if isinstance(parameter.type, OutputPlace) and parameter.type.decides:
-            continue
         if isinstance(parameter.type, OutputFile):
             if isinstance(value, Place):
                 value = None if value.is_folder else value.path
