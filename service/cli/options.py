@@ -272,12 +272,9 @@ def user_errors() -> Iterator[None]:
     local = context is not None and bool(context.params.get("local"))
     try:
         yield
-    except DataError as error:
-        raise click.ClickException(
-            "\n".join(error_lines(error.message, error.fields, local=local))
-        ) from error
-    except ServiceError as error:
-        message = NO_KEY if error.code == "no-key" else str(error)
+    except (DataError, ServiceError) as error:
+        message = error.message if isinstance(error, DataError) else str(error)
+        message = NO_KEY if error.code == "no-key" else message
         raise click.ClickException("\n".join(error_lines(message, error.fields, local=local))) from error
     except OSError as error:
         raise click.ClickException(str(error)) from error
@@ -348,11 +345,17 @@ def check_fresh_folder(folder: Path, inputs: Sequence[Path] = (), *, overwrite: 
 
 
 def write_json(path: Path | None, content: dict[str, Any], *, overwrite: bool = False) -> None:
-    """Write ``content`` to ``path``, if a path is given. Raises ``ClickException`` if the file cannot be written."""
+    """Write ``content`` as ``write_file`` does."""
     if path is not None:
         text = json.dumps(content, indent=1, allow_nan=False) + "\n"
+        write_file(path, lambda file: file.write_text(text, "utf-8"), overwrite=overwrite)
+
+
+def write_file(path: Path | None, write: Callable[[Path], object], *, overwrite: bool = False) -> None:
+    """Write to ``path``, if a path is given. Raises ``ClickException`` if the file cannot be written."""
+    if path is not None:
         with user_errors(), written(path, overwrite=overwrite) as partial:
-            partial.write_text(text, "utf-8")
+            write(partial)
 
 
 def fits_files(paths: Sequence[Path]) -> list[Path]:

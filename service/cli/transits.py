@@ -30,13 +30,13 @@ from service.cli.options import (
     options_of,
     progress_bar,
     user_errors,
+    write_file,
     write_json,
     writes_files,
 )
 from service.cli.progress import Report as Progress
 from service.cli.progress import echo
 from service.client.operations import Operations
-from service.client.outputs import written
 from workers.contract.requests import GapDiagnose, Report
 
 SHOWN = 3
@@ -413,7 +413,5 @@ def plan(
                 progress=say,
             )
         write_json(json_file, found.as_json(), overwrite=overwrite)
-        if output is not None:
-            with written(output, overwrite=overwrite) as partial:
-                partial.write_text(plan_page(found), "utf-8")
+        write_file(output, lambda file: file.write_text(plan_page(found), "utf-8"), overwrite=overwrite)
     echo("\n".join(lines(found)))
