@@ -13,7 +13,7 @@ from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 
 from service.http.callers import Bulk, Caller, KeyFirst, Reading
-from service.http.paging import Page, Paging, no_cursor, place
+from service.http.paging import Page, Paging, place, position
 from service.http.problems import RESPONSES, Problem, as_problems, problem
 from service.http.quotas import check_room, check_rows
 from service.http.state import Shared
@@ -281,8 +281,9 @@ def get_bulk(bulk_id: BulkId, caller: Reading, state: Shared) -> BulkView:
 def list_failures(bulk_id: BulkId, paging: Paging, caller: Reading, state: Shared) -> Page[Failed]:
     """The failed images, in the order of the run."""
     row = find(state, caller, bulk_id)
+    (after,) = place(paging.cursor, position) or (-1,)
     items = state.catalogue.bulks.progress.items(
-        row.id, ItemState.FAILED, after=_after(paging.cursor), limit=paging.limit + 1
+        row.id, ItemState.FAILED, after=after, limit=paging.limit + 1
     )
     return paging.page(items, Failed.model_validate, lambda item: (str(item.position),))
 
@@ -431,13 +432,3 @@ def _done(changed: bool, row: BulkRow, expected: str, advice: str = "") -> None:
             "wrong-phase",
             f"expected a bulk run in phase {expected}; this bulk run is in phase {row.phase}{advice}",
         )
-
-
-def _after(cursor: str | None) -> int:
-    """The position in a cursor. Raises ``Problem`` 422 if this service did not issue it."""
-    parts = place(cursor, 1)
-    if parts is None:
-        return -1
-    if not parts[0].isdecimal() or len(parts[0]) > 9:
-        raise no_cursor()
-    return int(parts[0])

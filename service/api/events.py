@@ -26,6 +26,7 @@ import math
 import time
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Annotated, Any, Generic
 
 from fastapi import APIRouter, Header, Query, Request, Response
@@ -44,8 +45,6 @@ from service.http.problems import RESPONSES
 from service.http.state import Shared
 from service.views import JobView
 from workers.catalogue.followed import MOST, Followable, Followed, Place, State
-from workers.contract.bulk import BULK_ENDED, BulkPhase
-from workers.contract.jobs import Phase
 
 log = logging.getLogger(__name__)
 LOOK_EVERY_S = 0.5
@@ -82,20 +81,6 @@ DESCRIBED_OF_OWNER: dict[int | str, dict[str, Any]] = {
 Said = tuple[str, bool]
 
 
-@dataclass(frozen=True)
-class Seen:
-    """The state of a row: the values that show whether the row has changed, its view, and whether it has ended."""
-
-    values: tuple[Any, ...]
-    view: Callable[[], BaseModel]
-    ended: bool
-
-    @property
-    def id(self) -> str:
-        """The id of the event for this state."""
-        return hashlib.sha256(json.dumps(self.values).encode()).hexdigest()[:16]
-
-
 @router.get(
     "/v1/jobs/{job_id}/events",
     summary="The progress of a job as events",
@@ -107,15 +92,8 @@ async def follow_job(
 ) -> Response:
     """Send the job now and after every change, until the job ends."""
     await run_in_threadpool(find_job, state, caller, job_id)
-
-    def look() -> Seen | None:
-        row = state.catalogue.jobs.get(job_id)
-        if row is None:
-            return None
-        values = (row.phase, row.attempt, row.stage, row.step, row.steps, row.cancel_requested, row.queue)
-        return Seen(values, lambda: JobView.of(row), Phase(row.phase).ended)
-
-    return await _follow(request, state, caller, look, last_id)
+    get = partial(state.catalogue.jobs.get, job_id)
+    return await _follow(request, state, caller, get, state.catalogue.followed_jobs, JobView.of, last_id)
 
 
 @router.get(
@@ -129,36 +107,43 @@ async def follow_bulk(
 ) -> Response:
     """Send the bulk run now and after every change, until the run ends. The stream of a paused run stays open."""
     await run_in_threadpool(find_bulk, state, caller, bulk_id)
-
-    def look() -> Seen | None:
-        row = state.catalogue.bulks.get(bulk_id)
-        if row is None:
-            return None
-        values = (row.phase, row.total, row.done, row.failed)
-        return Seen(values, lambda: BulkView.of(row, state), BulkPhase(row.phase) in BULK_ENDED)
-
-    return await _follow(request, state, caller, look, last_id)
+    get = partial(state.catalogue.bulks.get, bulk_id)
+    view = partial(BulkView.of, state=state)
+    return await _follow(request, state, caller, get, state.catalogue.followed_bulks, view, last_id)
 
 
 async def _follow(
-    request: Request, state: Shared, caller: Caller, look: Callable[[], Seen | None], last_id: str | None
+    request: Request,
+    state: Shared,
+    caller: Caller,
+    get: Callable[[], Followable | None],
+    rows: Followed[Followable],
+    view: Callable[[Followable], BaseModel],
+    last_id: str | None,
 ) -> Response:
-    """The stream of one row, until the row reaches its final state or is deleted. look: None if the row was deleted."""
-    now = await run_in_threadpool(look)
-    if now is not None and now.ended and now.id == last_id:
+    """The stream of one row, until the row reaches its final state or is deleted. get: None if the row was deleted."""
+
+    def look(row: Followable) -> tuple[str, bool]:
+        """The id of the event for the state of the row, and whether the row has ended."""
+        now = rows.state(row)
+        return hashlib.sha256(json.dumps(now.values).encode()).hexdigest()[:16], now.ended_at is not None
+
+    row = await run_in_threadpool(get)
+    if row is not None and look(row) == (last_id, True):
         return Response(status_code=204)  # 204 tells a browser not to reconnect
 
     def say() -> Said:
         nonlocal last_id
-        now = look()
-        if now is None:
+        row = get()
+        if row is None:
             return "event: gone\ndata: {}\n\n", True
-        if now.id == last_id and not now.ended:
+        event_id, ended = look(row)
+        if event_id == last_id and not ended:
             return "", False
-        name = "end" if now.ended else "progress"
-        text = f"id: {now.id}\nevent: {name}\ndata: {now.view().model_dump_json()}\n\n"
-        last_id = now.id
-        return text, now.ended
+        name = "end" if ended else "progress"
+        text = f"id: {event_id}\nevent: {name}\ndata: {view(row).model_dump_json()}\n\n"
+        last_id = event_id
+        return text, ended
 
     return _stream(request, state, caller, say)
 
@@ -340,7 +325,7 @@ async def follow_all(
         Watch(
             "bulk",
             catalogue.followed_bulks,
-            lambda row: BulkView.of(row, state),
+            partial(BulkView.of, state=state),
             owner,
             frozenset(bulk or ()),
             since,

@@ -12,7 +12,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from service.api.psfs import TEXT
 from service.http.callers import Caller, Certifying, KeyFirst, Reading
-from service.http.paging import Page, Paging, number, place
+from service.http.paging import Page, Paging, finite, identity, place
 from service.http.problems import RESPONSES, as_problems
 from service.http.quotas import check_rows
 from service.http.state import Shared, State
@@ -287,8 +287,8 @@ def list_affected(
     superseded: Annotated[bool, Query(description="only products whose PSF has a successor")] = False,
 ) -> Page[AffectedView]:
     """Products whose PSF is deprecated, sorted by PSF; the products of each PSF are listed newest first."""
-    at = place(paging.cursor, 3)
-    after = None if at is None else Place(at[0], number(at[1]), at[2])
+    at = place(paging.cursor, identity, finite, identity)
+    after = None if at is None else Place(*at)
     rows = state.catalogue.affected.page(
         caller.owner, superseded=superseded, limit=paging.limit + 1, after=after
     )

@@ -67,21 +67,8 @@ class _Id(click.ParamType):
         return [CompletionItem(incomplete, type="file")] if self.or_file else []
 
 
-class _Server(click.Option):
-    """``--server``, whose help says whether the command needs a service."""
-
-    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
-        """The names and the help text of the option."""
-        record = super().get_help_record(ctx)
-        if record is None:
-            return None
-        names, text = record
-        local = any(param.name == "local" for param in ctx.command.params)
-        return names, f"{text}; --local needs none" if local else text
-
-
-def server_option(what: str) -> Callable[[Command], Command]:
-    """The options ``--server`` and ``--key`` of a command that can send a request to a service."""
+def server_option(what: str, *, or_local: bool = False) -> Callable[[Command], Command]:
+    """The options ``--server`` and ``--key`` of a command that can send a request to a service; or_local: and ``--local``."""
     key = click.option(
         "--key",
         envvar="HELIOPSF_KEY",
@@ -91,12 +78,12 @@ def server_option(what: str) -> Callable[[Command], Command]:
     )
     server = click.option(
         "--server",
-        cls=_Server,
         metavar="ADDRESS",
         envvar="HELIOPSF_SERVER",
-        help=f"{what} [default: {DEFAULT_SERVER}]",
+        help=f"{what} [default: {DEFAULT_SERVER}]{'; --local needs none' if or_local else ''}",
     )
-    return lambda command: server(key(command))
+    local = click.option("--local", is_flag=True, help="Run in this process, without a service")
+    return lambda command: server(key(local(command) if or_local else command))
 
 
 def psf_option(
@@ -109,8 +96,8 @@ def psf_option(
 
 
 ID, ID_OR_FILE = _Id(), _Id(or_file=True)
-SERVER = server_option("Address of the service, which this command needs")
-LOCAL = click.option("--local", is_flag=True, help="Run in this process, without a service")
+_ADDRESS = "Address of the service, which this command needs"
+SERVER, SERVER_OR_LOCAL = server_option(_ADDRESS), server_option(_ADDRESS, or_local=True)
 SERVER_FOR_IDS = server_option("Address of the service, which is needed only if a PSF is given by its id")
 PSF = psf_option(
     "PSF: an id or a file; an instrument (aia_171, FILE.toml); or a published PSF (aia_171_2025) [default: the certified PSF for the image, else the one built]",

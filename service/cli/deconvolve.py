@@ -14,12 +14,12 @@ import click
 from psfcore.deconvolve.summary import summary_lines
 from psfcore.errors import DataError
 from psfcore.files import sha256_of
-from service.cli.connection import LOCAL, PSF, SERVER, connection, named_psf, short
+from service.cli.connection import PSF, SERVER_OR_LOCAL, connection, named_psf, short
 from service.cli.options import (
     DRAWN,
     OUTPUT_FOLDER,
+    OUTPUT_PLACE,
     OVERWRITE,
-    OutputPlace,
     Place,
     counted,
     fits_files,
@@ -30,7 +30,6 @@ from service.cli.options import (
     say_warnings,
     user_errors,
     write_json,
-    writes_files,
 )
 from service.cli.progress import Report, echo
 from service.client.errors import ServiceError
@@ -63,7 +62,7 @@ FOR_ALL = (401, 403)
     "-o",
     "--output",
     required=True,
-    type=OutputPlace(decides=True),
+    type=OUTPUT_PLACE,
     metavar="FILE|FOLDER/",
     help="File of the product (FITS), or folder for the products of several images",
 )
@@ -72,9 +71,8 @@ FOR_ALL = (401, 403)
 @click.option("--plot", type=DRAWN, help="Write the image before and after (PNG)")
 @click.option("--changes", type=DRAWN, help="Write difference, ratio and histograms (PNG)")
 @click.option("--timings", is_flag=True, help="Print how long each stage took; needs --local")
-@SERVER
-@LOCAL
-@writes_files
+@SERVER_OR_LOCAL
+@OVERWRITE
 def deconvolve(
     images: tuple[Path, ...],
     output: Place,
@@ -197,8 +195,7 @@ def _many(
 @PSF
 @options_of(Deconvolve, "other_channel", "context", "method", "steps", "noise", "saturation_dn", "again")
 @click.option("--most", default=60, type=click.IntRange(1, 200), help="Images on the contact sheet")
-@SERVER
-@LOCAL
+@SERVER_OR_LOCAL
 @OVERWRITE
 def changes(
     images: tuple[Path, ...],

@@ -198,14 +198,7 @@ class OutputFolder(_Output):
 
 
 class OutputPlace(OutputFile):
-    """The type of an option that names a file to write, or a folder in which the command chooses the file name.
-
-    decides: the command itself decides whether the path is a folder, and checks the path.
-    """
-
-    def __init__(self, *, decides: bool = False) -> None:
-        super().__init__()
-        self.decides = decides
+    """The type of an option that names a file to write, or a folder in which the command chooses the file name."""
 
     def convert(  # type: ignore[override]
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
@@ -279,12 +272,9 @@ def user_errors() -> Iterator[None]:
     local = context is not None and bool(context.params.get("local"))
     try:
         yield
-    except DataError as error:
-        raise click.ClickException(
-            "\n".join(error_lines(error.message, error.fields, local=local))
-        ) from error
-    except ServiceError as error:
-        message = NO_KEY if error.code == "no-key" else str(error)
+    except (DataError, ServiceError) as error:
+        message = error.message if isinstance(error, DataError) else str(error)
+        message = NO_KEY if error.code == "no-key" else message
         raise click.ClickException("\n".join(error_lines(message, error.fields, local=local))) from error
     except OSError as error:
         raise click.ClickException(str(error)) from error
@@ -325,8 +315,6 @@ def _files_of(
     inputs: list[Path] = []
     for parameter in parameters:
         value = given.get(parameter.name or "")
-        if isinstance(parameter.type, OutputPlace) and parameter.type.decides:
-            continue
         if isinstance(parameter.type, OutputFile):
             if isinstance(value, Place):
                 value = None if value.is_folder else value.path
@@ -357,17 +345,17 @@ def check_fresh_folder(folder: Path, inputs: Sequence[Path] = (), *, overwrite: 
 
 
 def write_json(path: Path | None, content: dict[str, Any], *, overwrite: bool = False) -> None:
-    """Write ``content`` to ``path``, if a path is given. Raises ``ClickException`` if the file cannot be written."""
-    if path is None:
-        return
-    text = json.dumps(content, indent=1, allow_nan=False) + "\n"
-    try:
-        with written(path, overwrite=overwrite) as partial:
-            partial.write_text(text, "utf-8")
-    except ServiceError as error:
-        raise click.ClickException(str(error)) from error
-    except OSError as error:
-        raise click.ClickException(f"cannot write {path}: {error.strerror or error}") from error
+    """Write ``content`` as ``write_file`` does."""
+    if path is not None:
+        text = json.dumps(content, indent=1, allow_nan=False) + "\n"
+        write_file(path, lambda file: file.write_text(text, "utf-8"), overwrite=overwrite)
+
+
+def write_file(path: Path | None, write: Callable[[Path], object], *, overwrite: bool = False) -> None:
+    """Write to ``path``, if a path is given. Raises ``ClickException`` if the file cannot be written."""
+    if path is not None:
+        with user_errors(), written(path, overwrite=overwrite) as partial:
+            write(partial)
 
 
 def fits_files(paths: Sequence[Path]) -> list[Path]:

@@ -6,6 +6,7 @@ A command imports numerical libraries only when it is called, so that other comm
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 from pathlib import Path
 
 import click
@@ -23,11 +24,11 @@ from service.cli.options import (
     progress_bar,
     psf_limits,
     user_errors,
+    write_file,
     write_json,
     writes_files,
 )
 from service.cli.progress import echo
-from service.client.outputs import written
 
 INSTRUMENT = click.option("--instrument", default="hri_euv", metavar="NAME|FILE",
                           help="A known instrument, or an instrument file (TOML)")  # fmt: skip
@@ -71,9 +72,7 @@ def fresnel(
             windows=windows,
             progress=lambda done, of: report("distances", done, of),
         )
-        if plot is not None:
-            with written(plot, overwrite=overwrite) as picture:
-                fresnel_png(study, picture)
+        write_file(plot, partial(fresnel_png, study), overwrite=overwrite)
     focus = study.focus
     echo(
         f"best focus: mirrors {focus.separation_mm:.3f} mm apart, {focus.shift_mm:+.3f} mm from the distance in the drawing "
@@ -124,9 +123,8 @@ def arms(
         measured = measure_arms(
             flare.pixels, centre, reference=reference, saturated=~flare.valid, n_arms=n_arms
         )
-        if plot is not None:
-            with written(plot, overwrite=overwrite) as picture:
-                arms_png(flare.pixels, measured, picture, unit=unit_label(flare))
+        draw = partial(arms_png, flare.pixels, measured, unit=unit_label(flare))
+        write_file(plot, draw, overwrite=overwrite)
     for angle, sigma in zip(measured.angles_deg, measured.angles_sigma_deg, strict=True):
         echo(f"arm at {angle:8.3f} ± {sigma:.3f} degrees from +x towards +y")
     echo(f"spacing  {measured.spacing_px:8.4f} ± {measured.spacing_sigma_px:.4f} px")
@@ -157,9 +155,7 @@ def design(
         study = design_study(
             load_instrument(instrument), _numbers("--pitches", pitches), _numbers("--wires", wires)
         )
-        if plot is not None:
-            with written(plot, overwrite=overwrite) as picture:
-                design_png(study, picture)
+        write_file(plot, partial(design_png, study), overwrite=overwrite)
     names = [field.name for field in dataclasses.fields(study.rows[0])]
     echo("  ".join(names))
     for row in study.rows:
@@ -241,9 +237,8 @@ def flare(
             distances_px=distances_px,
             noise=None if noise is None else Noise(*noise),
         )
-        if plot is not None:
-            with written(plot, overwrite=overwrite) as picture:
-                flare_png(found.difference, found.usable, found.comparison, picture, unit=found.unit)
+        draw = partial(flare_png, found.difference, found.usable, found.comparison, unit=found.unit)
+        write_file(plot, draw, overwrite=overwrite)
     echo("\n".join(summary_lines(found.comparison)))
     if json_file is not None:
         inputs = {

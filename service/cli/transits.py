@@ -17,7 +17,7 @@ from typing import Any
 import click
 
 from psfcore.errors import DataError
-from service.cli.connection import LOCAL, SERVER, connection, named_psf, psf_option
+from service.cli.connection import SERVER_OR_LOCAL, connection, named_psf, psf_option
 from service.cli.options import (
     DRAWN,
     FILE,
@@ -30,13 +30,13 @@ from service.cli.options import (
     options_of,
     progress_bar,
     user_errors,
+    write_file,
     write_json,
     writes_files,
 )
 from service.cli.progress import Report as Progress
 from service.cli.progress import echo
 from service.client.operations import Operations
-from service.client.outputs import written
 from workers.contract.requests import GapDiagnose, Report
 
 SHOWN = 3
@@ -82,8 +82,7 @@ def _reporting(
 @PLOT
 @psf_option("PSF to test: an id or a file [default: fit a PSF to TRANSIT]")
 @options_of(Report, "dark_offsets", "shapes", "seed", "noise", "saturation_dn")
-@SERVER
-@LOCAL
+@SERVER_OR_LOCAL
 @writes_files
 def report(
     transit: Path,
@@ -174,8 +173,7 @@ def gap() -> None:
     help="Also test the effects in these files, whose code is executed. Only with --local; in a service set HELIOPSF_GAP_EFFECTS",
 )
 @options_of(GapDiagnose, "coverage", "seed", "noise", "saturation_dn")
-@SERVER
-@LOCAL
+@SERVER_OR_LOCAL
 @writes_files
 def diagnose(
     transit: Path,
@@ -415,7 +413,5 @@ def plan(
                 progress=say,
             )
         write_json(json_file, found.as_json(), overwrite=overwrite)
-        if output is not None:
-            with written(output, overwrite=overwrite) as partial:
-                partial.write_text(plan_page(found), "utf-8")
+        write_file(output, lambda file: file.write_text(plan_page(found), "utf-8"), overwrite=overwrite)
     echo("\n".join(lines(found)))

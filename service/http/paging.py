@@ -28,45 +28,44 @@ Row = TypeVar("Row")
 Cursor = Annotated[str | None, Query(description="the cursor in `next` of the previous page")]
 
 
-def place(cursor: str | None, count: int) -> list[str] | None:
-    """The parts of a cursor; the last part is an id. Raises ``Problem`` 422 if this service did not issue it."""
+def place(cursor: str | None, *kinds: Callable[[str], Any]) -> tuple[Any, ...] | None:
+    """The parts of a cursor, each read by one of ``kinds`` (``finite``, ``position``, ``identity``); None without a cursor.
+
+    Raises ``Problem`` 422 if this service did not issue the cursor.
+    """
     if cursor is None:
         return None
     try:
         parts = base64.urlsafe_b64decode(cursor.encode()).decode("ascii").split(" ")
+        return tuple(kind(part) for kind, part in zip(kinds, parts, strict=True))
     except (binascii.Error, ValueError) as error:
-        raise no_cursor() from error
-    if len(parts) != count or not parts[-1].isalnum() or not all(map(str.isprintable, parts)):
-        raise no_cursor()
-    return parts
+        raise Problem(
+            422,
+            "bad-cursor",
+            "expected the cursor in the `next` address of an earlier page; got a text that is not a cursor: repeat the "
+            "request without a cursor to start at the first page",
+        ) from error
 
 
-def number(part: str) -> float:
-    """A time in a cursor. Raises ``Problem`` 422 if it is not a finite number."""
-    try:
-        at = float(part)
-    except ValueError as error:
-        raise no_cursor() from error
-    if not math.isfinite(at):
-        raise no_cursor()
-    return at
+def finite(part: str) -> float:
+    """A finite number, such as a time. Raises ValueError."""
+    if not math.isfinite(value := float(part)):
+        raise ValueError(part)
+    return value
 
 
-def following(request: Request, *parts: str) -> str:
-    """The address of the page that starts after the row that these parts name."""
-    cursor = base64.urlsafe_b64encode(" ".join(parts).encode()).decode()
-    query = request.url.include_query_params(cursor=cursor)
-    return f"{query.path}?{query.query}"
+def position(part: str) -> int:
+    """The position of a row in its list. Raises ValueError."""
+    if not part.isdecimal() or len(part) > 9:
+        raise ValueError(part)
+    return int(part)
 
 
-def no_cursor() -> Problem:
-    """The problem for a cursor that this service did not issue."""
-    return Problem(
-        422,
-        "bad-cursor",
-        "expected the cursor in the `next` address of an earlier page; got a text that is not a cursor: repeat the request "
-        "without a cursor to start at the first page",
-    )
+def identity(part: str) -> str:
+    """An id. Raises ValueError."""
+    if not part.isalnum():
+        raise ValueError(part)
+    return part
 
 
 def _place_in_time(row: Any) -> tuple[str, ...]:
@@ -85,9 +84,7 @@ class Listing:
     def query(self) -> dict[str, Any]:
         """Arguments of the query for the rows: one more than the page has, which shows that there is a next page, after
         the (created_at, id) in the cursor. Raises ``Problem`` 422 if this service did not issue the cursor."""
-        parts = place(self.cursor, 2)
-        after = None if parts is None else (number(parts[0]), parts[1])
-        return {"limit": self.limit + 1, "after": after}
+        return {"limit": self.limit + 1, "after": place(self.cursor, finite, identity)}
 
     def following(
         self, rows: Sequence[Row], place_of: Callable[[Row], tuple[str, ...]] = _place_in_time
@@ -96,7 +93,11 @@ class Listing:
 
         place_of: the parts of the cursor that names a row.
         """
-        return following(self.request, *place_of(rows[self.limit - 1])) if len(rows) > self.limit else None
+        if len(rows) <= self.limit:
+            return None
+        cursor = base64.urlsafe_b64encode(" ".join(place_of(rows[self.limit - 1])).encode()).decode()
+        query = self.request.url.include_query_params(cursor=cursor)
+        return f"{query.path}?{query.query}"
 
     def page(
         self,

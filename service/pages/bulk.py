@@ -28,7 +28,7 @@ from service.api.bulk import (
     submit_bulk,
 )
 from service.http.callers import Caller
-from service.http.paging import Cursor, Listing, following, number, place
+from service.http.paging import Cursor, Listing, finite, place, position
 from service.http.problems import Problem
 from service.http.state import Shared, State
 from service.pages.forms import Sent, SentForm, checked, chosen_method, text, usual_steps
@@ -210,12 +210,12 @@ def bulk(
     """The progress of a run, the reasons of its failures, and a page of its results. A script keeps the progress up to date."""
     view = get_bulk(bulk_id, caller, state)
     progress = state.catalogue.bulks.progress
-    after = _after(cursor)
+    after = place(cursor, finite, position)
     if order == "worst":
         rows = progress.worst(bulk_id, after=after, limit=PER_SHEET + 1)
     else:
         rows = progress.items(bulk_id, ItemState.DONE, after=after[1] if after else -1, limit=PER_SHEET + 1)
-    last = rows[PER_SHEET - 1] if len(rows) > PER_SHEET else None
+    listing = Listing(request, PER_SHEET, cursor)
     reasons = _reasons(bulk_id, caller, state) if view.images.failed else []
     return page(
         request,
@@ -227,7 +227,7 @@ def bulk(
         results=_cards(rows[:PER_SHEET], caller, state),
         order=order,
         first_page=cursor is None,
-        next=None if last is None else following(request, repr(last.score or 0.0), str(last.position)),
+        next=listing.following(rows, lambda row: (repr(row.score or 0.0), str(row.position))),
         look_from=LOOK_FROM,
         allowed={name: view.phase in phases for name, phases in ALLOWED_IN.items()},
         phases={name: " ".join(sorted(phases)) for name, phases in ALLOWED_IN.items()},
@@ -297,20 +297,6 @@ def _reasons(bulk_id: str, caller: Caller, state: State) -> list[dict[str, Any]]
 def _told(failed: BulkItemRow) -> str:
     error = failed.error or {}
     return of_error(error.get("code", ""), error.get("message", ""))
-
-
-def _after(cursor: str | None) -> tuple[float, int] | None:
-    """The (score, position) in a cursor. Raises ``Problem`` 422 if this service did not issue it."""
-    parts = place(cursor, 2)
-    if parts is None:
-        return None
-    if not parts[1].isdecimal() or len(parts[1]) > 9:
-        raise Problem(
-            422,
-            "bad-cursor",
-            "expected the address of a page of results; got another one: go back to the first page",
-        )
-    return number(parts[0]), int(parts[1])
 
 
 def _cards(rows: Sequence[BulkItemRow], caller: Caller, state: State) -> list[dict[str, Any]]:

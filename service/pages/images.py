@@ -40,7 +40,7 @@ from service.pages.forms import (
 )
 from service.pages.jobs import job_lines
 from service.pages.login import PageReading, PageSubmitting
-from service.pages.rendering import duration, number, page, short
+from service.pages.rendering import counted, duration, number, page, short
 from service.pages.sentences import draft, of_problem
 from service.views import JobView, ProductView
 from workers.catalogue.psfs import PsfFilter
@@ -214,7 +214,7 @@ def product_line(product: ProductView) -> dict[str, Any]:
     done = product.details["steps_done"]
     return {
         "id": product.id,
-        "told": f"{product.details['method']['name']}, {done} step{'' if done == 1 else 's'}, PSF {product.psf_version}",
+        "told": f"{product.details['method']['name']}, {counted(done, 'step')}, PSF {product.psf_version}",
         "created_at": product.created_at,
     }
 
@@ -252,7 +252,7 @@ def _lines(found: EstimateView) -> list[str]:
         return [*lines, "This product exists already."]
     waiting = ""
     if found.waiting_before:
-        waiting = f", after {found.waiting_before} other job{'' if found.waiting_before == 1 else 's'}"
+        waiting = f", after {counted(found.waiting_before, 'other job')}"
     seconds = found.estimate.seconds
     time = duration(seconds).capitalize() if seconds < 1 else f"About {duration(seconds)}"
     return [*lines, f"{time} and {found.estimate.memory_mib} MiB{waiting}."]

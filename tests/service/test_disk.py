@@ -9,11 +9,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import psycopg
 import pytest
 from astropy.io import fits
 from fastapi.testclient import TestClient
-from sqlalchemy.exc import OperationalError
 
 from psfcore.fits import hdus
 from service.cli import doctor
@@ -97,28 +95,6 @@ def test_a_job_that_finds_the_disk_full_says_so_and_can_be_submitted_again(
     assert len(jobs) == 3
     product = result_of(api, run_jobs, "deconvolve", **parameters)
     assert api.get(product["file"]).status_code == 200
-
-
-def test_a_full_disk_of_the_database_is_tried_again_and_then_said(
-    api: TestClient,
-    settings: Settings,
-    run_jobs: Callable[[], None],
-    image_file: Path,
-    psf_file: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    parameters = {"image_id": upload(api, image_file), "psf_id": upload(api, psf_file, "/v1/psfs")}
-    job = api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": parameters}).json()["id"]
-
-    def fail(*_: object, **__: object) -> None:
-        raise OperationalError("INSERT", {}, psycopg.errors.DiskFull())
-
-    monkeypatch.setattr(Catalogue, "add", fail)
-    for attempt in range(1, settings.max_attempts + 1):
-        run_jobs()
-        found = api.get(f"/v1/jobs/{job}").json()
-        assert found["attempt"] == attempt
-    assert (found["phase"], found["error"]["code"]) == ("ERROR", "storage-full")
 
 
 def test_a_bulk_run_that_finds_the_disk_full_stops_and_goes_on_with_room(

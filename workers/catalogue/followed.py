@@ -100,7 +100,7 @@ class Followed(Generic[Followable]):
         if not ids:
             return {}
         rows = self._database.all(select(self._table).where(self._these(owner, ids)))
-        return {row.id: (self._state(row), row) for row in rows}
+        return {row.id: (self.state(row), row) for row in rows}
 
     def _these(self, owner: str, ids: Collection[str]) -> ColumnElement[bool]:
         given = self._table.id.in_(sorted(ids)) & (self._table.owner == owner)
@@ -108,7 +108,8 @@ class Followed(Generic[Followable]):
             given &= condition
         return given
 
-    def _state(self, row: Followable) -> State:
+    def state(self, row: Followable) -> State:
+        """The state of a row that was read."""
         return State(row.id, row.ended_at, tuple(getattr(row, name) for name in self._names))
 
 

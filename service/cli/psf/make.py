@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from service.cli.connection import LOCAL, SERVER, connection, short
+from service.cli.connection import SERVER_OR_LOCAL, connection, short
 from service.cli.options import (
     FILE,
     JSON,
@@ -40,8 +40,7 @@ TRANSIT = click.argument("transit", type=click.Path(exists=True, path_type=Path)
 @options_of(PsfBuild, "size", "component")
 @click.option("-o", "--output", required=True, type=OUTPUT, help="Write the PSF (FITS)")
 @PLOT
-@SERVER
-@LOCAL
+@SERVER_OR_LOCAL
 @writes_files
 def build(
     instrument: str,
@@ -82,8 +81,7 @@ TOLD_PX = (10, 100)  # the JSON and `psf show` have the curve at more radii
 @JSON
 @PLOT
 @options_of(PsfFit, "shape", "as_published", "noise", "saturation_dn")
-@SERVER
-@LOCAL
+@SERVER_OR_LOCAL
 @writes_files
 def fit(
     transit: Path,
@@ -132,8 +130,7 @@ def say_fit(fit: dict[str, Any]) -> None:
 @click.option("--json", "json_file", required=True, type=OUTPUT, help="Write all numbers to this file (JSON)")
 @PLOT
 @options_of(CrossValidate, "scheme", "runs", "shape", "noise")
-@SERVER
-@LOCAL
+@SERVER_OR_LOCAL
 @writes_files
 def crossval(
     transit: Path,

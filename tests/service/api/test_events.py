@@ -4,7 +4,6 @@ stream, what each look tells, and the stream over HTTP."""
 from __future__ import annotations
 
 import json
-import threading
 import time
 from collections.abc import Iterator
 from itertools import groupby
@@ -40,29 +39,6 @@ def live(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> Iterator[Live]:
     monkeypatch.setattr(events, "LOOK_EVERY_S", 0.05)
     with running(settings.model_copy(update={"streams_per_caller": 2})) as server:
         yield server
-
-
-def test_a_job_is_followed_to_its_end(live: Live) -> None:
-    job_id, lease = live.job()
-    seen: list[dict[str, Any]] = []
-
-    def follow() -> None:
-        seen.extend(live.client.follow(f"/v1/jobs/{job_id}"))
-
-    following = threading.Thread(target=follow)
-    following.start()
-    wait_for(lambda: len(seen) == 1, "the first event", timeout_s=10)
-    live.catalogue.jobs.progress(lease, "building", 1, 2)
-    wait_for(lambda: len(seen) == 2, "the second", timeout_s=10)
-    time.sleep(0.3)
-    assert len(seen) == 2, "nothing is said where nothing has changed"
-    live.catalogue.jobs.complete(lease, "r" * 64)
-    following.join(10)
-    assert [event["phase"] for event in seen] == ["EXECUTING", "EXECUTING", "COMPLETED"]
-    assert seen[1]["progress"]["stage"] == "building" and seen[2]["result"].endswith("r" * 64)
-    # The result that this job names was never made; only the answer about one job looks whether it is there.
-    assert {**seen[2], "result_deleted": True} == live.client.job(job_id)
-    assert live.streams() == 0
 
 
 def test_a_reconnected_client_gets_what_changed_meanwhile(live: Live) -> None:

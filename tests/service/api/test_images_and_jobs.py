@@ -10,12 +10,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from astropy.io import fits
 from fastapi.testclient import TestClient
 
-from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
-from tests.service.conftest import job_after, refusal, result_of, upload
+from tests.conftest import write_image, write_psf
+from tests.service.conftest import refusal, upload
 from workers.settings import Settings
 
 
@@ -96,27 +95,6 @@ def test_an_image_of_a_known_instrument_needs_no_psf_id(api: TestClient, tmp_pat
     assert recipe["instrument"] is None and recipe["instrument_file"].startswith("turn_deg = 20.00\n")
 
 
-def test_a_job_is_cancelled_before_its_start_and_a_failed_one_says_why(
-    api: TestClient, run_jobs: Callable[[], None], image_file: Path, psf_file: Path, tmp_path: Path
-) -> None:
-    psf_id = upload(api, psf_file, "/v1/psfs")
-    parameters = {"image_id": upload(api, image_file), "psf_id": psf_id}
-    body = {"kind": "deconvolve", "parameters": parameters}
-    job = api.post("/v1/jobs", json=body).json()
-    assert api.delete(f"/v1/jobs/{job['id']}").json()["phase"] == "ABORTED"
-    run_jobs()
-    assert api.get(f"/v1/jobs/{job['id']}").json()["phase"] == "ABORTED"
-    assert api.get("/v1/products").json()["items"] == []
-    again = api.post("/v1/jobs", json=body).json()
-    assert again["id"] != job["id"]
-    api.delete(f"/v1/jobs/{again['id']}")
-
-    fits.PrimaryHDU(fits.getdata(psf_file) * float("nan")).writeto(tmp_path / "nan.fits")
-    image_id = upload(api, tmp_path / "nan.fits")
-    error = job_after(api, run_jobs, "deconvolve", image_id=image_id, psf_id=psf_id)["error"]
-    assert error["fault"] == "user" and error["code"] == "all-nan" and "expected" in error["message"]
-
-
 def test_a_database_that_is_away_is_503(api: TestClient, settings: Settings) -> None:
     assert api.get("/healthz").json()["status"] == "ok"
     for file in settings.data_dir.glob("catalogue.sqlite*"):
@@ -124,33 +102,6 @@ def test_a_database_that_is_away_is_503(api: TestClient, settings: Settings) -> 
     (settings.data_dir / "catalogue.sqlite").mkdir()  # cannot be opened as a file
     api.app.state.heliopsf.catalogue.close()  # connections that are open would still see the old file
     refusal(api.get("/v1/jobs"), 503, "database-away")
-
-
-MASKED_INSTRUMENT = f"""{SMALL_INSTRUMENT}
-[mount]
-basis = "drawing"
-mask_image = {{ file = "mask.png", width_mm = 4.0 }}
-"""
-
-
-def test_a_psf_of_an_instrument_file_and_a_mask_of_the_users(
-    api: TestClient, run_jobs: Callable[[], None], tmp_path: Path
-) -> None:
-    fits.PrimaryHDU(np.ones((64, 64), "f4")).writeto(tmp_path / "mask.fits")
-    parameters: dict[str, Any] = {"instrument_file": MASKED_INSTRUMENT, "size": 64}
-    error = job_after(api, run_jobs, "psf-build", **parameters)["error"]
-    assert error["code"] == "mask-missing" and "mask.png" in error["message"]
-    parameters["mask_id"] = upload(api, tmp_path / "mask.fits")
-    psf = result_of(api, run_jobs, "psf-build", **parameters)
-    assert (psf["name"], psf["status"], psf["details"]["shape"]) == ("small", "draft", [64, 64])
-    assert psf["details"]["provenance"]["parameters"]["mask_id"] == parameters["mask_id"]
-    with fits.open(io.BytesIO(api.get(psf["file"]).content)) as hdus:
-        text = bytes(np.asarray(hdus["INSTRUMENT"].data["TOML"][0]))
-    assert text.decode() == MASKED_INSTRUMENT
-    listed = api.get("/v1/psfs", params={"instrument": "small"}).json()["items"]
-    assert [item["id"] for item in listed] == [psf["id"]]
-    assert api.get("/v1/psfs", params={"instrument": "aia"}).json()["items"] == []
-    assert api.get(psf["preview"]).content.startswith(b"\x89PNG")
 
 
 # --- estimates -------------------------------------------------------------------------------------------

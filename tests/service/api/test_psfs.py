@@ -225,33 +225,6 @@ def test_products_of_a_superseded_psf_are_listed(
         assert api.get("/v1/affected", params={"cursor": cursor}).status_code == 422, place
 
 
-def test_lineage_and_rerun(
-    api: TestClient, run_jobs: Callable[[], None], image_file: Path, psf_file: Path
-) -> None:
-    """What a lineage and a rerun say is tested in tests/workers/tasks/test_rerun.py."""
-    body = {"image_id": upload(api, image_file), "psf_id": upload(api, psf_file, "/v1/psfs")}
-    product = result_of(api, run_jobs, "deconvolve", **body, method={"name": "linear", "steps": 1})
-    told = api.get(f"/v1/products/{product['id']}/lineage").json()
-    assert told["made"]["job_id"] == product["details"]["job_id"]
-    image, parent = told["parents"]
-    assert (image["type"], image["id"], image["there"]) == ("image", body["image_id"], True)
-    assert parent == api.get(f"/v1/psfs/{body['psf_id']}/lineage").json()
-
-    asked = api.post(f"/v1/products/{product['id']}/rerun")
-    assert asked.status_code == 202, asked.text
-    again = api.post(f"/v1/products/{product['id']}/rerun").json()
-    assert again["id"] != asked.json()["id"]
-    assert api.delete(f"/v1/jobs/{again['id']}").json()["phase"] == "ABORTED"
-    run_jobs()
-    report = api.get(api.get(asked.headers["Location"]).json()["result"]).json()
-    assert report["details"]["same"] is True and report["about_id"] == product["id"]
-    assert api.get(report["file"]).json()["largest_relative_difference"] == 0.0
-    assert api.get(report["output"]).content[:9] == b"SIMPLE  ="
-    listed = api.get("/v1/reports", params={"about_id": product["id"]}).json()["items"]
-    assert [one["id"] for one in listed] == [report["id"]]
-    assert api.get(f"/v1/reports/{'0' * 64}/output").status_code == 404
-
-
 def test_the_series_of_an_uploaded_psf_comes_from_its_file_or_the_request(
     api: TestClient, tmp_path: Path
 ) -> None:
@@ -325,23 +298,6 @@ def test_a_psf_that_was_built_here(api: TestClient, run_jobs: Callable[[], None]
     assert api.post("/v1/jobs", json=body).status_code == 202
     run_jobs()
     assert api.get(address).status_code == 200
-
-
-def test_a_psf_in_use_is_not_deleted(
-    api: TestClient, image_file: Path, psf_file: Path, run_jobs: Callable[[], None]
-) -> None:
-    """What counts as a use is tested in tests/workers/catalogue/test_owners.py. A failed job is none."""
-    psf_id = upload(api, psf_file, "/v1/psfs")
-    body = {"image_id": upload(api, image_file), "psf_id": psf_id, **FEW}
-    waiting = api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": body}).json()["id"]
-    assert waiting[:12] in refusal(api.delete(f"/v1/psfs/{psf_id}"), 409, "psf-in-use")
-    api.delete(f"/v1/jobs/{waiting}")
-    fits.setval(image_file, "OBJECT", value="dark")
-    with fits.open(image_file, mode="update") as hdus:
-        hdus[0].data[:] = 0
-    failed = job_after(api, run_jobs, "deconvolve", image_id=upload(api, image_file), psf_id=psf_id)
-    assert failed["error"]["code"] == "no-signal"
-    assert api.delete(f"/v1/psfs/{psf_id}").status_code == 200
 
 
 def test_only_the_owner_deletes_and_only_with_the_scope(

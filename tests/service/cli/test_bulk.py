@@ -5,30 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-from unittest.mock import MagicMock
 
 import pytest
-from click.testing import CliRunner
 from fastapi.testclient import TestClient
 
-from service.cli import connection
-from service.cli.main import main
 from service.client.http import Client
 from tests.conftest import write_image
 from tests.service.conftest import upload
 from workers.settings import Settings
 
 Command = Callable[..., str]
-
-
-@pytest.fixture
-def service(monkeypatch: pytest.MonkeyPatch) -> MagicMock:
-    """A client that answers as it is told."""
-    service = MagicMock()
-    service.__enter__.return_value = service
-    service.psf.return_value = {"status": "draft"}
-    monkeypatch.setattr(connection, "remote", lambda server: service)
-    return service
 
 
 def described(phase: str, total: int, *, listed: bool) -> dict[str, Any]:
@@ -38,13 +24,6 @@ def described(phase: str, total: int, *, listed: bool) -> dict[str, Any]:
         "id": "a" * 32, "phase": phase, "images": images | {"to_look_at": 0}, "images_an_hour": None,
         "time_left_s": None, "error": None, "listed": listed,
     }  # fmt: skip
-
-
-def test_a_number_of_images_that_may_grow_is_a_lower_limit(service: MagicMock) -> None:
-    for listed, said in ((False, "3 of at least 400 done"), (True, "3 of 400 done")):
-        service.bulk.return_value = described("PAUSED", 400, listed=listed)
-        told = CliRunner().invoke(main, ["bulk", "status", "a" * 32]).output
-        assert f"PAUSED: {said}, 0 failed, 0 in progress, 397 waiting" in told
 
 
 def test_the_progress_of_a_run_that_lists_files_has_no_end(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -65,23 +44,6 @@ def test_the_progress_of_a_run_that_lists_files_has_no_end(monkeypatch: pytest.M
         ("images", 3, 500),
         ("images", 3, 500),
     ]
-
-
-def test_a_dry_run_names_the_path_of_a_product(service: MagicMock) -> None:
-    estimate = {
-        "images": 4, "complete": True, "examined": 4, "refused_images": 0, "refused": [], "existing": 0,
-        "output_bytes": 2**20, "seconds": 8.0, "workers": 1, "memory_mib": 100,
-    }  # fmt: skip
-    path = "/out/SOLO/2021/03/01/a.fits"
-    for more, named in (
-        ({"example_output": path}, True),
-        ({"example_output": None, "complete": False}, False),
-    ):
-        service.estimate_bulk.return_value = estimate | more
-        told = CliRunner().invoke(main, ["bulk", "submit", "/x/*.fits", "--psf", "a" * 64, "--dry-run"])
-        assert told.exit_code == 0 and (f"for example: {path}" in told.output) == named, told.output
-        assert ("complete: no other file matches" in told.output) == named, told.output
-        assert ("the run may be larger" in told.output) != named, told.output
 
 
 @pytest.fixture

@@ -9,14 +9,12 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 from astropy.io import fits
 from click.testing import CliRunner, Result
 
-from service.cli import connection
 from service.cli.main import main
 from service.client.http import Client
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
@@ -118,15 +116,6 @@ def test_the_psf_of_an_instrument_may_be_named(folder: Path, monkeypatch: pytest
     assert done.exit_code == 1 and "aperture.diameter_cm" in done.output and "'diameter_mm'" in done.output
 
 
-def test_errors_need_no_figures(folder: Path) -> None:
-    image = folder / "in" / "0.fits"
-    done = run("deconvolve", image, "-o", folder / "e.fits", "--errors", 2, *options(folder))
-    assert done.exit_code == 0 and "measured (photon transfer" in done.output, done.output
-    with fits.open(folder / "e.fits") as hdus:
-        assert hdus[0].header["DCNVNOIS"] == "measured" and (hdus["ERROR"].data > 0).all()
-        assert any("noise: photon gain" in str(line) for line in hdus[0].header["HISTORY"])
-
-
 def test_what_does_not_fit_together_is_refused(folder: Path) -> None:
     images = (folder / "in" / "0.fits", folder / "in" / "1.fits")
     plot = run("deconvolve", *images, "-o", folder / "out", "--plot", folder / "p.png", *options(folder))
@@ -138,48 +127,6 @@ def test_what_does_not_fit_together_is_refused(folder: Path) -> None:
     assert none.exit_code == 2 and "contain none" in none.output
     gone = run("deconvolve", *images, folder / "gone.fits", "-o", folder / "out", *options(folder))
     assert gone.exit_code == 2 and not (folder / "out").exists()
-
-
-def test_a_bulk_run_with_failures_ends_with_status_1(monkeypatch: pytest.MonkeyPatch) -> None:
-    counts = {"total": 3, "reused": 0, "at_work": 0, "waiting": 0, "to_look_at": 0}
-    times = {"images_an_hour": None, "time_left_s": None, "error": None, "listed": True}
-    service = MagicMock()
-    service.__enter__.return_value = service
-    service.psf.return_value = {"status": "draft"}
-    monkeypatch.setattr(connection, "remote", lambda server: service)
-    for phase, failed, status in (("COMPLETED", 0, 0), ("COMPLETED", 1, 1), ("ERROR", 0, 1)):
-        bulk = {
-            "id": "b" * 32,
-            "phase": phase,
-            "images": counts | {"done": 3 - failed, "failed": failed},
-            **times,
-        }
-        for ask in (service.bulk, service.submit_bulk, service.wait_for_bulk):
-            ask.return_value = bulk
-        assert run("bulk", "status", "b" * 32, "--wait").exit_code == status, phase
-        assert run("bulk", "submit", "/x/*.fits", "--psf", "a" * 64, "--wait").exit_code == status, phase
-        assert run("bulk", "status", "b" * 32).exit_code == 0, phase
-
-
-def test_a_region_becomes_a_product_with_its_coordinates(folder: Path) -> None:
-    image = folder / "in" / "0.fits"
-    for key in ("CRPIX1", "CRPIX2"):
-        fits.setval(image, key, value=30.5)
-    nx = fits.getdata(image).shape[1]
-    region = ("--region", f"8:{nx - 8},16:48", "--region-error", 0.9)
-    done = run("deconvolve", image, "-o", folder / "box.fits", *region, *options(folder))
-    assert done.exit_code == 0, done.output
-    assert f"region 8:{nx - 8},16:48, rim " in done.output and "by at most" in done.output
-    product = fits.open(folder / "box.fits")
-    assert product[0].data.shape == product["QUALITY"].data.shape == (32, nx - 16)
-    before, after = fits.getheader(image), product[0].header
-    assert [after[key] - before[key] for key in ("CRPIX1", "CRPIX2")] == [-8, -16]
-    assert after["DCNVBOX"] == f"8:{nx - 8},16:48"
-    assert "differs from the same box" in "".join(after["HISTORY"])
-    out = folder / "out.fits"
-    refused = run("deconvolve", image, "-o", out, "--region", "8:40", *options(folder))
-    assert refused.exit_code != 0 and "expected a region as x0:x1,y0:y1" in refused.output
-    assert not out.exists()
 
 
 def test_an_image_that_does_not_fit_into_the_memory_is_refused(

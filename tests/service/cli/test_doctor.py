@@ -213,26 +213,6 @@ def test_versions_are_compared_with_what_was_tested_and_what_is_needed(
     assert "pytest" not in found.found
 
 
-def test_the_table_says_what_state_found_and_what_to_do() -> None:
-    findings = {
-        "one": cli_doctor.Finding("ok", "well"),
-        "another": cli_doctor.Finding("broken", "a long story " * 20, "mend it"),
-    }
-    lines = list(cli_doctor.table(findings, 80))
-    assert lines[0].split()[::2] == ["one", "well"] and "another" in lines[1] and "broken" in lines[1]
-    assert lines[-2].strip() == "-> mend it" and lines[-1] == "1 ok, 1 broken"
-    assert max(map(len, lines[2:])) <= 80
-
-
-def test_an_address_has_no_secret() -> None:
-    for url, said in (
-        ("postgresql://u:s3cret@db:5432/heliopsf?sslmode=require", "postgresql://db:5432/heliopsf"),
-        ("redis://:s3?cret@db", "the URL that is set"),
-        ("redis://u:s3@cret@db/0", "redis://db/0"),
-    ):
-        assert cli_doctor.address(url) == said
-
-
 def test_a_setting_that_is_none_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HELIOPSF_LEASE_S", "-1")
     answer = ask()

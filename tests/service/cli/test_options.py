@@ -18,7 +18,7 @@ from psfcore.instruments.unknown import unknown_instrument
 from service.cli import options as cli_options
 from service.cli import progress
 from service.cli.main import main
-from service.cli.progress import Pace, duration, progress_bar, say
+from service.cli.progress import Pace, progress_bar, say
 from service.client.http import ServiceError
 from tests.conftest import write_image, write_psf
 
@@ -40,16 +40,6 @@ def test_a_command_reads_as_many_pixels_as_the_settings_let_it(
         result = CliRunner().invoke(main, ["psf", *command, str(psf_file)])
         assert result.exit_code == 1
         assert str(32 * 32) in result.output.replace(",", "")
-
-
-def test_a_folder_to_fill_is_taken_where_it_is_empty_or_forced(tmp_path: Path) -> None:
-    cli_options.check_fresh_folder(tmp_path / "new")
-    (tmp_path / "full").mkdir()
-    cli_options.check_fresh_folder(tmp_path / "full")
-    (tmp_path / "full" / "file").touch()
-    with pytest.raises(click.ClickException, match="not empty"):
-        cli_options.check_fresh_folder(tmp_path / "full")
-    cli_options.check_fresh_folder(tmp_path / "full", overwrite=True)
 
 
 def test_an_error_of_the_user_is_a_line_and_an_error_of_ours_keeps_its_traceback() -> None:
@@ -116,11 +106,6 @@ def test_a_minus_is_no_name_of_an_output(image_file: Path, monkeypatch: pytest.M
         assert not (image_file.parent / "-").exists()
 
 
-def test_numbers_and_lists_in_sentences() -> None:
-    assert [cli_options.counted(n, "image") for n in (0, 1, 2)] == ["0 images", "1 image", "2 images"]
-    assert [cli_options.listed("abc"[:n]) for n in (1, 2, 3)] == ["a", "a and b", "a, b and c"]
-
-
 # --- progress --------------------------------------------------------------------------------------------
 
 
@@ -143,12 +128,6 @@ def test_the_time_left_counts_this_count_of_steps_alone_and_shrinks_while_a_step
     assert pace.left_s(5, 11, 255.0) == pytest.approx(6.0)
     assert pace.left_s(0, 11, 400.0) is None, "the same number of steps, a new round"
     assert [pace.left_s(1, 11, 402.0 + wait) for wait in (0, 5, 50)] == pytest.approx([20.0, 15.0, 0.0])
-
-
-def test_durations_are_told_in_the_largest_unit() -> None:
-    assert [duration(s) for s in (0, 6.4, 119, 125, 8000, 200_000)] == [
-        "0 s", "6 s", "119 s", "2 min", "2 h", "2 days",
-    ]  # fmt: skip
 
 
 def test_a_terminal_shows_a_bar(
@@ -193,15 +172,3 @@ def test_a_job_that_takes_longer_than_estimated_has_no_time_left(
             report("fitting", min(10 * second, 99), 100)
             clock[0] += 1
     assert capsys.readouterr().err.splitlines() == [f"fitting: 99 % after {s} s" for s in (10, 20, 30)]
-
-
-def test_a_stage_and_its_step_as_text() -> None:
-    for stage, step, steps, text in (
-        ("reading", 3, 20, "reading: step 3 of 20"),
-        ("error estimate", 3, 12, "error estimate: realisation 3 of 12"),
-        ("fit: round 2", 43, 100, "fit: round 2: 43 %"),
-        ("saving", 0, 1, "saving"),
-        ("saving", 1, 1, "saving: step 1 of 1"),
-        ("compiling kernels (only once)", 0, 0, "compiling kernels (only once)"),
-    ):
-        assert progress.step_text(stage, step, steps) == text

@@ -104,17 +104,6 @@ def test_an_existing_output_is_replaced_only_if_told(files: Path, monkeypatch: p
         assert not [path for path in files.iterdir() if path.name.endswith(".part")]
 
 
-@pytest.mark.usefixtures("idle")
-def test_an_output_that_cannot_be_written_is_noticed_before_the_work(
-    files: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(files)
-    for option in (("-o", "nowhere/new.fits"), ("-o", "new.fits", "--plot", "nowhere/new.fits")):
-        refused = run(*DECONVOLVE, *option)
-        assert refused.exit_code == 1 and "cannot write nowhere/new.fits" in refused.output, refused.output
-        assert not Path("new.fits").exists()
-
-
 def outputs(command: click.Command) -> Iterator[str]:
     for parameter in command.params:
         if isinstance(parameter.type, options.OutputFile):

@@ -182,14 +182,6 @@ def test_a_request_cannot_choose_whose_code_is_run(api: TestClient, folder: Path
         assert api.post("/v1/jobs", json=request).status_code == 422, one
 
 
-def test_a_psf_that_was_not_fitted_is_no_start(folder: Path, tmp_path: Path) -> None:
-    kernel = np.zeros((33, 33), "f4")
-    kernel[16, 16] = 1.0
-    fits.PrimaryHDU(kernel).writeto(tmp_path / "point.fits")
-    done = run(folder, "--local", "--psf", tmp_path / "point.fits")
-    assert done.exit_code == 1 and "expected a PSF that was fitted to a transit" in done.output
-
-
 def test_a_corrected_psf_that_there_is_not_is_said_after_all_else(
     folder: Path, diagnosed: Diagnosed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -5,16 +5,12 @@ from __future__ import annotations
 import gzip
 import io
 import json
-import tarfile
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-from astropy.io import fits
-
-from tests.fits_bombs import lying_tiles, padded
+from tests.fits_bombs import padded
 
 MIB = 2**20
 JSON = {"Content-Type": "application/json"}
@@ -79,35 +75,14 @@ def primary(bitpix: int, *axes: int) -> bytes:
     return cards(first, f"BITPIX  = {bitpix:>20}", f"NAXIS   = {len(axes):>20}", *sizes)
 
 
-def tiles(px: int) -> bytes:
-    """An honest file of zeros in compressed tiles: px * px pixels of 16 bits, a tile a row, all of one stream."""
-    stream = gzip.compress(bytes(2 * px))
-    rows = np.zeros(px, dtype=[("COMPRESSED_DATA", ">i4", (2,))])
-    rows["COMPRESSED_DATA"][:, 0] = len(stream)
-    header = fits.open(io.BytesIO(lying_tiles(stream)), disable_image_compression=True)[1].header
-    header.update(NAXIS2=px, PCOUNT=len(stream), ZNAXIS1=px, ZNAXIS2=px, ZTILE1=px)
-    return (
-        fits.PrimaryHDU().header.tostring().encode()
-        + header.tostring().encode()
-        + padded(rows.tobytes() + stream)
-    )
-
-
 def long_header(mib: int) -> bytes:
     """Cards without end."""
     return primary(16, 8, 8)[:400] + b"COMMENT x".ljust(80) * (mib * MIB // 80)
 
 
-EMPTY_IMAGE = cards(
-    "XTENSION= 'IMAGE   '", "BITPIX  =                    8", "NAXIS   =                    0"
-)
 FILES = [
-    image("half a megabyte of tiles for 537 of pixels", 422, "too-many-pixels", lambda: tiles(16384)),
-    image("60000 x 60000 pixels", 422, "too-many-pixels", lambda: primary(16, 60_000, 60_000)),
     image("100 MB of cards in gzip", 422, "header-too-long", lambda: gzip.compress(long_header(100), 1)),
-    image("thousands of HDUs", 422, "too-many-hdus", lambda: cards("SIMPLE  =                    T", "BITPIX  = 8", "NAXIS   = 0") + 2500 * EMPTY_IMAGE),
     image("gzip that declares 300 GB", 422, "too-many-bytes", lambda: gzip.compress(primary(8, 10**5, 10**5, 30) + bytes(10**6))),
-    image("gzip of gzip", 422, "not-fits", lambda: gzip.compress(gzip.compress(primary(8, 8, 8)))),
     image("a script", 415, "not-fits", lambda: b"#!/bin/sh\nrm -rf /\n" * 500),
     image("more than may be sent", 413, "too-large", lambda: b"SIMPLE  =" + bytes(9 * MIB)),
     image("nothing", 400, "empty-upload", lambda: b""),
@@ -143,40 +118,9 @@ def transit_zip(*more: tuple[str, bytes]) -> bytes:
     return zipped(("transit.json", MANIFEST), ("0.fits", SMALL_FITS), *more)
 
 
-def tarred(name: str, *, link: str = "", content: bytes = b"x", mode: str = "w") -> bytes:
-    """A .tar of a transit, and one more member: a file, or a symbolic link."""
-    file = io.BytesIO()
-    with tarfile.open(fileobj=file, mode=mode) as archive:  # type: ignore[call-overload]
-        for one, of in (
-            ("transit.json", MANIFEST),
-            ("0.fits", SMALL_FITS),
-            (name, b"" if link else content),
-        ):
-            info = tarfile.TarInfo(one)
-            info.size = len(of)
-            if link and one == name:
-                info.type, info.linkname = tarfile.SYMTYPE, link
-            archive.addfile(info, io.BytesIO(of))
-    return file.getvalue()
-
-
-def lying_tar() -> bytes:
-    """A member that says it is of 2^60 bytes."""
-    content = bytearray(tarred("b.fits"))
-    at = content.rindex(b"b.fits")
-    info = tarfile.TarInfo("b.fits")
-    info.size = 2**60
-    content[at : at + 512] = info.tobuf(tarfile.GNU_FORMAT)
-    return bytes(content)
-
-
 ARCHIVES = [
     transit("a name that climbs, zip", 422, "archive-climbs", lambda: transit_zip(("../x.fits", b"x"))),
-    transit("a symbolic link, tar", 422, "archive-not-plain", lambda: tarred("l.fits", link="/etc/passwd")),
     transit("a zip of 100 MB of zeros", 413, "archive-too-large", lambda: transit_zip(("b.fits", bytes(100 * MIB)))),
-    transit("a tar.gz of 100 MB of zeros", 413, "archive-too-large", lambda: tarred("b.fits", content=bytes(100 * MIB), mode="w:gz")),
-    transit("a member of 2^60 bytes", 413, "archive-too-large", lying_tar),
-    transit("20000 members", 413, "archive-too-large", lambda: transit_zip(*((f"{n}.x", b"") for n in range(20_000)))),
     transit("a transit.json of lists in lists", 422, "bad-manifest", lambda: zipped(("transit.json", b"[" * DEEP))),
 ]  # fmt: skip
 
@@ -205,24 +149,16 @@ REQUESTS = [
     body("NaN", 422, "invalid-request", b'{"kind":"deconvolve","parameters":{"image_id":"%s","saturation_dn":NaN}}' % A.encode()),
     body("20 MB of JSON", 413, "too-large", b'"' + b"x" * 20 * MIB + b'"'),
     Attack("JSON that says it is text", 422, "invalid-request", content=lambda: b'{"kind":"psf-build"}', headers={"Content-Type": "text/plain"}),
-    job("an unknown method", 422, "invalid-request", "deconvolve", image_id=A, method={"name": "x"}),
-    job("two instruments", 422, "invalid-request", "psf-build", instrument="hri_euv", instrument_file="x"),
     job("a mask that was not uploaded", 404, "no-such-image", "psf-build", instrument="hri_euv", mask_id=A),
     job("no TOML", 422, "bad-instrument-file", "psf-build", instrument_file="= = ="),
-    job("a kind that is code", 422, "invalid-request", "__import__('os').system('true')"),
-    job("a parameter more", 422, "invalid-request", "psf-build", instrument="hri_euv", callback="http://evil.example/"),
     job("an instrument that is a path", 422, "unknown-instrument", "psf-build", instrument="../../../etc/passwd"),
     job("an image that is a path", 422, "invalid-request", "deconvolve", image_id="../" * 20 + "etc/passwd"),
     job("an image that was not uploaded", 404, "no-such-image", "deconvolve", image_id=A),
     job("a transit that was not uploaded", 404, "no-such-transit", "psf-fit", transit_id=A),
-    job("steps without end", 422, "invalid-request", "deconvolve", image_id=A, method={"name": "linear", "steps": 10**9}),
-    job("draws without end", 422, "invalid-request", "deconvolve", image_id=A, error_draws=10**9),
-    job("a PSF without end", 422, "invalid-request", "psf-build", instrument="hri_euv", size=2**31),
     job("TOML: lists in lists", 422, "bad-instrument-file", "psf-build", instrument_file="a = " + "[" * DEEP),
     job("TOML: tables in tables", 422, "bad-instrument-file", "psf-build", instrument_file="a = " + "{b=" * DEEP),
     job("TOML: a key of 30000 parts", 422, "bad-instrument-file", "psf-build", instrument_file=".".join("a" * 30_000) + " = 1"),
     job("TOML: a number of 60000 digits", 422, "bad-instrument-file", "psf-build", instrument_file="a = " + "9" * 60_000),
-    job("TOML: more than fits", 422, "invalid-request", "psf-build", instrument_file="#" * 70_000),
     form("a form without boundary", b"--x\r\n", kind="multipart/form-data"),
     form("a form with a boundary of 5000", b"--x\r\n", kind="multipart/form-data; boundary=" + "x" * 5000),
     form("a form without a file", PART % b"other" + b"1\r\n--x--\r\n"),

@@ -116,16 +116,6 @@ def test_a_bad_file_is_refused_wherever_and_however_it_is_sent(service: Keyed) -
                     assert "expected" in refusal(ann.post(where, **options), attack.status, attack.code)
 
 
-def test_an_unknown_name_gets_the_known_one(service: Keyed) -> None:
-    for kind, parameters, known in (
-        ("reprot", {"transit_id": "0" * 64}, "report"),
-        ("psf-build", {"instrumnt": "hri_euv"}, "instrument"),
-    ):
-        answer = service.client("ann").post("/v1/jobs", json={"kind": kind, "parameters": parameters})
-        assert f"did you mean '{known}'?" in refusal(answer, 422, "invalid-request")
-        assert any("did you mean" in error["message"] for error in answer.json()["errors"])
-
-
 def test_tiles_that_lie_pass_the_header_and_end_the_job_within_bounds(
     service: Keyed, data: Path, psf_file: Path
 ) -> None:

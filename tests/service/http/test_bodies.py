@@ -4,25 +4,20 @@ Sockets and connections: how the server listens, and how many files it may open.
 from __future__ import annotations
 
 import asyncio
-import gc
 import json
 import re
-import resource
 import select
-import signal
 import socket
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
-import uvicorn
 from fastapi.testclient import TestClient
 
 from psfcore.fits.blocks import FitsLimits
@@ -280,53 +275,3 @@ def test_a_port_that_is_in_use_is_refused() -> None:
         listener.listen()
         with pytest.raises(OSError, match="in use"):
             server.listening("127.0.0.1", listener.getsockname()[1])
-
-
-@pytest.fixture
-def unfrozen() -> Iterator[None]:
-    """Nothing is kept from the garbage collector, now and afterwards; signals are handled afterwards as before."""
-    handler = signal.getsignal(signal.SIGTERM)
-    gc.unfreeze()
-    yield
-    gc.unfreeze()
-    signal.signal(signal.SIGTERM, handler)
-
-
-@pytest.mark.usefixtures("unfrozen")
-def test_a_started_server_keeps_idle_connections_and_spares_the_garbage_collector(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """An idle connection stays open longer than clients use it; what the start has loaded is not looked at again."""
-    servers: list[uvicorn.Server] = []
-    run = uvicorn.Server.run
-
-    def run_and_stop(running: uvicorn.Server, sockets: list[socket.socket]) -> None:
-        servers.append(running)
-        thread = threading.Thread(target=run, args=(running, sockets))
-        thread.start()
-        wait_for(lambda: running.started and gc.get_freeze_count() > 0, "the server listens", timeout_s=20)
-        running.should_exit = True
-        thread.join(20)
-
-    monkeypatch.setattr(uvicorn.Server, "run", run_and_stop)
-    monkeypatch.setattr(server, "embedded_worker", lambda settings: nullcontext())
-    monkeypatch.setattr(server.logs, "configure", lambda settings, *, verbose: None)
-    server.serve(settings_in(tmp_path), "127.0.0.1", 0, lambda address: None)
-    used_for_s = httpx.Limits().keepalive_expiry
-    assert used_for_s is not None and servers[0].config.timeout_keep_alive > 2 * used_for_s
-
-
-def test_a_server_may_open_as_many_files_as_the_system_allows(monkeypatch: pytest.MonkeyPatch) -> None:
-    infinity, most = resource.RLIM_INFINITY, server.MOST_OPEN_FILES
-    for soft, hard, raised in (
-        (1024, 10_000, 10_000),
-        (1024, infinity, most),
-        (1024, 1024, None),
-        (infinity, infinity, None),
-    ):
-        limits: list[tuple[int, int]] = []
-        with monkeypatch.context() as patched:
-            patched.setattr(resource, "getrlimit", lambda _what, both=(soft, hard): both)
-            patched.setattr(resource, "setrlimit", lambda _what, both, limits=limits: limits.append(both))
-            server._allow_open_files()
-        assert limits == ([] if raised is None else [(raised, hard)]), (soft, hard)

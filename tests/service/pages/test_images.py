@@ -17,7 +17,8 @@ from service.pages.sentences import of_error, plain
 from tests.conftest import write_image, write_psf
 from tests.service.conftest import execute, result_of, upload
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.tables import ProductRow
+from workers.catalogue.tables import DEFAULT_OWNER, ImageRow, ProductRow
+from workers.files.store import Store
 
 PERSON = {"Accept": "text/html,application/xhtml+xml,*/*;q=0.8"}
 AIA = {"TELESCOP": "SDO/AIA", "INSTRUME": "AIA_3", "WAVELNTH": 1600, "CDELT1": 0.6, "CDELT2": 0.6}
@@ -60,25 +61,6 @@ def test_an_image_without_a_psf_is_told_so(api: TestClient, tmp_path: Path) -> N
     assert "none: choose a PSF" in page and "chosen for this image" not in page
     assert "2012-06-05T22:00:00.123" in page
     assert f'action="/psfs?image={xrt}"' in page, "a PSF is uploaded here"
-
-
-def test_the_psf_of_another_channel_is_refused_before_a_job(
-    api: TestClient, psf_file: Path, tmp_path: Path
-) -> None:
-    aia = image(api, tmp_path, **{**AIA, "WAVELNTH": 193})
-    psf = api.post("/v1/psfs?instrument=aia_171&channel=171", content=psf_file.read_bytes()).json()["id"]
-    first, last = checked(api, aia, psf_id=psf)
-    assert "the image is of aia_193, the PSF of aia_171" in first and "allow it below" in last
-    assert checked(api, aia, psf_id=psf, other_channel="1")[0].endswith("You chose this PSF.")
-
-
-def test_the_advice_is_that_of_the_error(api: TestClient, psf_file: Path, tmp_path: Path) -> None:
-    product = image(api, tmp_path, PSFID="0" * 64)
-    psf = upload(api, psf_file, "/v1/psfs")
-    first, last = checked(api, product, psf_id=psf)
-    assert "the card PSFID" in first and "allow it below" in last
-    page = api.get(f"/images/{product}?psf_id={psf}").text
-    assert "What you can do" not in page and "Upload a PSF" not in page
 
 
 def test_an_error_plane_needs_no_figures_and_the_form_takes_them(api: TestClient, tmp_path: Path) -> None:
@@ -228,3 +210,32 @@ def test_a_product_whose_psf_was_deprecated_says_what_to_do(
     assert f'<a href="/psfs/{better}">{name} 2.0.0</a>' in page
     assert f'<a href="/images/{image}?psf_id={better}&amp;method=linear&amp;steps=2' in page
     assert f'<a href="/psfs/{psf}">PSF of this product</a>' in page
+
+
+def test_lost_and_deleted_files_are_told(
+    api: TestClient, catalogue: Catalogue, image_file: Path, psf_file: Path, run_jobs: Callable[[], None]
+) -> None:
+    ids = {"image_id": upload(api, image_file), "psf_id": upload(api, psf_file, "/v1/psfs")}
+    product = result_of(api, run_jobs, "deconvolve", **ids, method={"name": "linear", "steps": 1})
+    store: Store = api.app.state.heliopsf.store  # type: ignore[attr-defined]
+    address, image = f"/products/{product['id']}", f"/images/{ids['image_id']}"
+    page = api.get(address).text
+    assert f'data-before="/v1{image}"' in page and 'role="alert"' not in page
+
+    store.path(ids["image_id"]).unlink()
+    page = api.get(address).text
+    assert "The file of the uploaded image is lost" in page and 'role="alert"' in page
+    assert "data-before" not in page and 'data-after="' in page and 'id="blink"' not in page
+    store.path(product["sha256"]).unlink()
+    page = api.get(address).text
+    assert "The file of this product is lost." in page and 'id="viewer"' not in page
+
+    deleted = api.post(f"{address}/delete", follow_redirects=False)
+    assert (deleted.status_code, deleted.headers["location"]) == (303, image)
+    assert api.get(address, headers=PERSON).status_code == 404
+    upload(api, image_file)
+    again = result_of(api, run_jobs, "deconvolve", **ids, method={"name": "linear", "steps": 1})
+    assert again["id"] == product["id"]
+    catalogue.delete(ImageRow, ids["image_id"], DEFAULT_OWNER)
+    assert "The uploaded image was deleted" in api.get(address).text
+    assert api.post(f"{address}/delete", follow_redirects=False).headers["location"] == "/"

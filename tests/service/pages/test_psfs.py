@@ -158,15 +158,6 @@ def test_a_form_says_whether_a_series_may_be_interpolated(
     assert wrong.status_code == 422 and "interpolated: " in wrong.text.lower()
 
 
-def test_an_error_of_a_form_is_a_page_that_names_the_field(api: TestClient, psf_id: str) -> None:
-    data = {"status": "certified", "with_range": "1", "valid_from": "yesterday"}
-    answer = api.post(f"/psfs/{psf_id}/status", data=data, headers=PERSON)
-    assert answer.status_code == 422 and "Valid from: " in answer.text
-    assert answer.headers["content-type"].startswith("text/html")
-    assert api.get(f"/psfs/{'0' * 64}", headers=PERSON).status_code == 404
-    assert f'action="/v1/psfs/{psf_id}/cutout"' in api.get(f"/psfs/{psf_id}").text
-
-
 def test_forms_are_shown_by_scope(settings: Settings, psf_file: Path) -> None:
     with keyed(settings) as service:
         psf_id = upload(service.client("ann"), psf_file, "/v1/psfs")
@@ -225,14 +216,6 @@ def test_the_ratio_of_two_psfs_of_one_shape_is_their_scale(
     cells = re.findall(r'<td class="number">([^<]*)</td></tr>', ratio)
     assert len(cells) > 10
     assert all(float(cell) == pytest.approx(SCALE, rel=1e-4) for cell in cells if cell)
-
-
-def test_the_form_leads_to_the_comparison(api: TestClient, both: tuple[str, str]) -> None:
-    page = api.get(f"/psfs/{both[0]}").text
-    assert f'action="/psfs/{both[0]}/vs"' in page and f'value="{both[1]}"' in page
-    answer = api.get(f"/psfs/{both[0]}/vs?other={both[1]}", follow_redirects=False)
-    assert answer.status_code == 303 and answer.headers["location"] == f"/psfs/{both[0]}/vs/{both[1]}"
-    assert api.get(f"/psfs/{both[0]}/vs/{'0' * 64}", headers=PERSON).status_code == 404
 
 
 def view(**details: object) -> PsfView:

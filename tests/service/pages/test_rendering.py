@@ -25,12 +25,10 @@ from service.pages.plots import (
     MAP_PX,
     RATIO,
     Plot,
-    Series,
     gap_map,
     rerun_makers,
     shown_radii,
     with_errors,
-    written,
 )
 from service.pages.rendering import POLICY, counted, date, duration, number, percent, size
 from tests.conftest import write_image, write_psf
@@ -247,11 +245,6 @@ def test_the_table_holds_x_the_values_and_the_ends_of_the_band() -> None:
     assert plot.rows == [(None, ["1", "2", "1.5", "2.5", ""]), (None, ["2", "4", "3", "5", "1e-05"])]
 
 
-def test_rows_of_unequal_length_are_refused() -> None:
-    with pytest.raises(ValueError, match="longer than"):
-        _ = Plot("t", "x", "y", [1.0, 2.0], [Series("a", [1.0])], names=["one"]).rows
-
-
 def test_radii_are_shown_densely_near_the_centre_and_in_ratios_farther_out() -> None:
     radii = [float(radius) for radius in range(1500)]
     shown = [radii[at] for at in shown_radii(radii)]
@@ -259,11 +252,6 @@ def test_radii_are_shown_densely_near_the_centre_and_in_ratios_farther_out() -> 
     far = [radius for radius in shown[:-1] if radius > FINE_TO_PX]
     assert all(b / a >= RATIO for a, b in pairwise(far)) and len(shown) < 150
     assert shown_radii([]) == []
-
-
-def test_numbers_are_written_so_that_a_script_reads_them() -> None:
-    for value, text in ((None, ""), (float("nan"), ""), (0.0, "0"), (1234567.0, "1.2346e+06")):
-        assert written(value) == text
 
 
 def image(number: int, residual: float | None, after: float | None = None) -> dict[str, object]:

@@ -175,3 +175,6 @@ def test_a_rerun_is_shown(api: TestClient, run_jobs: Callable[[], None]) -> None
     page = shown(api, f"/reports/{rerun}", "bit for bit", "<td>equal</td>", f'href="/psfs/{built}"', "job_id")
     assert "library numpy" not in page
     shown(api, f"/psfs/{built}", f"/reports/{rerun}")
+    assert api.get(f"/v1/reports/{rerun}/output").content.startswith(b"SIMPLE  =")
+    (listed,) = api.get("/v1/reports", params={"about_id": built}).json()["items"]
+    assert listed["id"] == rerun

@@ -10,15 +10,11 @@ from pathlib import Path
 import httpx
 import pytest
 from fastapi.testclient import TestClient
-from pydantic_xml import BaseXmlModel, element
-from vo_models.uws import Jobs, JobSummary, Parameter, Results
-from vo_models.uws.types import ExecutionPhase
 
 from psfcore.files import sha256_of
 from tests.service.conftest import upload
 from tests.service.keyed import keyed
-from tests.service.vo.made import add_product
-from tests.service.vo.test_jobs import BUILD, JOBS, created, document, parameters
+from tests.service.vo.test_jobs import JOBS, document, parameters
 from workers.catalogue.access import Scope
 from workers.catalogue.tables import ImageRow
 from workers.settings import Settings
@@ -156,26 +152,3 @@ def test_a_file_needs_the_scope_and_counts_for_its_owner(settings: Settings, ima
     with keyed(small) as service:
         large = {"f": ("sun.fits", image_file.read_bytes() + bytes(2**20))}
         assert post(service.client("ann"), JOBS, fields, large).status_code == 429
-
-
-class _Parameters(
-    BaseXmlModel, tag="parameters", ns="uws", nsmap={"uws": "http://www.ivoa.net/xml/UWS/v1.0"}
-):
-    """The parameters of a job, whatever their names."""
-
-    parameter: list[Parameter] = element(tag="parameter", default_factory=list)
-
-
-def test_vo_models_reads_the_documents(api: TestClient, tmp_path: Path) -> None:
-    ids = add_product(api, tmp_path)
-    pending = created(api, RUNID="<mine> & yours", **BUILD)
-    listed = Jobs.from_xml(api.get(JOBS).content)
-    assert {one.phase for one in listed.jobref or []} == {ExecutionPhase.PENDING, ExecutionPhase.COMPLETED}
-    waiting = JobSummary[_Parameters].from_xml(api.get(pending).content)
-    assert (waiting.run_id, waiting.owner_id, waiting.quote) == ("<mine> & yours", "local", None)
-    assert {one.id: one.value for one in waiting.parameters.parameter}["KIND"] == "psf-build"  # type: ignore[union-attr]
-    done = JobSummary[_Parameters].from_xml(api.get(f"{JOBS}/{ids['job']}").content)
-    assert done.start_time is not None and done.end_time is not None and done.end_time > done.start_time
-    results = Results.from_xml(api.get(f"{JOBS}/{ids['job']}/results").content)
-    for one in results.results or []:
-        assert api.get(str(one.href)).headers["content-type"] == one.mime_type

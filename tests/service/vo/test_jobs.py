@@ -20,8 +20,6 @@ from tests.conftest import SMALL_INSTRUMENT
 from tests.service.conftest import upload
 from tests.service.serving import in_own_loop
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.tables import DEFAULT_OWNER, JobRow
-from workers.contract.identities import canonical_hash
 from workers.settings import Settings
 
 JOBS = "/uws/jobs"
@@ -140,27 +138,6 @@ def test_a_job_s_life(
     assert (gone.status_code, gone.headers["location"]) == (303, "http://testserver/uws/jobs")
     assert api.get(job).status_code == api.delete(job, follow_redirects=False).status_code == 404
     assert api.get(row["result"]).status_code == 200, "what it made stays"
-
-
-def test_a_job_that_runs_at_once_and_its_equals(
-    api: TestClient, catalogue: Catalogue, run_jobs: Callable[[], None]
-) -> None:
-    as_json = {"kind": "psf-build", "parameters": {"instrument_file": SMALL_INSTRUMENT, "size": 128}}
-    first = created(api, PHASE="RUN", **BUILD)
-    assert api.get(f"{first}/phase").text == "QUEUED"
-    assert api.post("/v1/jobs", json=as_json).json()["id"] != first[-32:], "its terms would end it for others"
-    # A second client's job is its own: to delete one leaves the other.
-    second = created(api, **BUILD)
-    api.post(f"{second}/phase?PHASE=RUN", follow_redirects=False)
-    assert second != first and api.get(f"{second}/phase").text == "QUEUED"
-    run_jobs()
-    assert api.get(f"{first}/phase").text == api.get(f"{second}/phase").text == "COMPLETED"
-    hrefs = [[r.attrib[HREF] for r in document(api.get(f"{job}/results"))] for job in (first, second)]
-    assert hrefs[0] == hrefs[1]
-    keys = {row.request_key for row in catalogue.page(JobRow, owner=DEFAULT_OWNER, limit=10)}
-    assert len(keys) == 3 and all(len(key) == len(canonical_hash({})) for key in keys)
-    api.delete(first)
-    assert api.get(f"{second}/phase").text == "COMPLETED"
 
 
 def test_what_went_wrong(api: TestClient, run_jobs: Callable[[], None]) -> None:

@@ -6,7 +6,6 @@ import csv
 import hashlib
 import io
 import json
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -322,25 +321,6 @@ def test_invalid_requests_are_refused(api: TestClient, archive: Path, out: Path,
         answer = api.post("/v1/bulk", content=body, headers={"Content-Type": "application/json"})
         assert (answer.status_code, answer.json()["type"]) == (status, f"urn:heliopsf:{code}"), body[:300]
     assert api.get("/v1/bulk").json()["items"] == []
-
-
-def test_a_link_made_after_the_listing_is_not_followed(
-    api: TestClient, archive: Path, psf_id: str, work: Work, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bulk = started(api, files=[{"glob": f"{archive}/2020/image*"}], psf_id=psf_id)
-    path = archive / "2020" / "image 0.fits"
-    write_image(tmp_path / "secret.fits")
-    real = bulk_image.read_one
-
-    def swapped(*arguments: Any) -> Any:
-        path.unlink()
-        os.symlink(tmp_path / "secret.fits", path)
-        return real(*arguments)
-
-    monkeypatch.setattr("workers.bulk.task.read_one", swapped)
-    work()
-    (failed,) = failures(api, bulk)
-    assert failed["error"]["code"] == "path-not-allowed"
 
 
 def test_a_turn_lets_others_go_first_after_each_image(

@@ -10,7 +10,6 @@ from typing import Any
 
 import prov
 import pytest
-from astropy.io import fits
 
 from psfcore.deconvolve import run
 from psfcore.fits.blocks import FitsLimits
@@ -179,30 +178,10 @@ def two_psfs(command: Command, folder: Path) -> tuple[str, str]:
     return first, second
 
 
-def test_a_series_is_interpolated_for_an_image_between_two_psfs(command: Command, tmp_path: Path) -> None:
+def test_two_psfs_are_interpolated_on_request_and_for_an_image_between_them(
+    command: Command, tmp_path: Path
+) -> None:
     assert "no series yet" in command("psf", "series")
-    early, late = two_psfs(command, tmp_path)
-    command("psf", "certify", early, "--version", "1.0.0", "--to", "2022-03-01")
-    command("psf", "certify", late, "--version", "1.1.0", "--from", "2023-03-01")
-    assert command("psf", "series") == f"{SERIES}  not interpolated\n"
-    said = command("psf", "series", SERIES, "--interpolate", "--reason", "the mirrors age")
-    assert said == f"{SERIES}  may be interpolated\n"
-    image = tmp_path / "i.fits"
-    write_image(image, DETECTOR="HRI_EUV", WAVELNTH=174, **{"DATE-BEG": "2022-05-13T06:00:00"})
-    best = command("psf", "best", "--image", image)
-    assert "not built yet" in best and f"{early} (fitted 1.0.0), which holds until 2022-03-01" in best
-    command("deconvolve", image, "-o", tmp_path / "o.fits", "--steps", 2)
-    psf_id = fits.getheader(tmp_path / "o.fits")["PSFID"]
-    assert psf_id[:12] in best
-    lines = command("psf", "lineage", psf_id).splitlines()
-    assert "hri_euv-interpolated" in lines[0]
-    assert lines[1].startswith(f"  psf {early}  (fitted 1.0.0 certified; weight 0.800")
-    command("context", "create", "2022")
-    assert command("context", "show", "2022").count("may be interpolated") == 2
-    assert command("psf", "series", SERIES, "--no-interpolate") == f"{SERIES}  not interpolated\n"
-
-
-def test_two_psfs_are_interpolated_on_request(command: Command, tmp_path: Path) -> None:
     early, late = two_psfs(command, tmp_path)
     refused = command("psf", "interpolate", early, late, "--time", "2022-05-13", code=2)
     assert f"expected --before-until, because PSF {early} has no end" in refused
@@ -217,7 +196,22 @@ def test_two_psfs_are_interpolated_on_request(command: Command, tmp_path: Path) 
     command("psf", "certify", early, "--version", "1.0.0", "--to", "2022-03-01")
     command("psf", "certify", late, "--version", "1.1.0", "--from", "2023-03-01")
     again = command("psf", "interpolate", early, late, "--time", "2022-05-13")
-    assert again.split()[0] == said.split()[0], "the ends of the ranges are the default"
+    psf_id = again.split()[0]
+    assert psf_id == said.split()[0], "the ends of the ranges are the default"
+    lineage = command("psf", "lineage", psf_id).splitlines()
+    assert "hri_euv-interpolated" in lineage[0]
+    assert lineage[1].startswith(f"  psf {early}  (fitted 1.0.0 certified; weight 0.800")
+
+    assert command("psf", "series") == f"{SERIES}  not interpolated\n"
+    said = command("psf", "series", SERIES, "--interpolate", "--reason", "the mirrors age")
+    assert said == f"{SERIES}  may be interpolated\n"
+    image = tmp_path / "i.fits"
+    write_image(image, DETECTOR="HRI_EUV", WAVELNTH=174, **{"DATE-BEG": "2022-08-13T06:00:00"})
+    best = command("psf", "best", "--image", image)
+    assert "not built yet" in best and f"{early} (fitted 1.0.0), which holds until 2022-03-01" in best
+    command("context", "create", "2022")
+    assert command("context", "show", "2022").count("may be interpolated") == 2
+    assert command("psf", "series", SERIES, "--no-interpolate") == f"{SERIES}  not interpolated\n"
 
 
 def test_options_that_do_not_belong_together(command: Command) -> None:

@@ -21,7 +21,7 @@ from tests.transit_files import write_simulated, write_transit
 from tests.whole.stack import Stack
 
 NAME = "solo_L2_eui-hrieuv174-image_20220401T103005920_pseudolinear_"  # 60 characters without a space
-WIDTHS = (320, 390, 768, 1024)
+WIDTHS = (320, 768, 1024)  # beside those that ``good`` looks at
 BEYOND_THEIR_CARDS = """(all) => all.filter((one) => one.getBoundingClientRect().right >
     one.closest(".card").getBoundingClientRect().right + 1).map((one) => one.outerHTML.slice(0, 80))"""
 

@@ -125,14 +125,6 @@ def end_sessions(stack: Stack, key: str) -> None:
     engine.dispose()
 
 
-def test_the_api_answers_401_without_a_window_of_the_browser(page: Page, watch: Watch) -> None:
-    watch.allowed.append("401")
-    answer = page.goto("/v1/jobs")
-    assert answer is not None and answer.status == 401
-    page.goto("/login")
-    assert page.evaluate("async () => (await fetch('/v1/jobs')).status") == 401
-
-
 def test_a_page_of_another_site_can_link_and_cannot_change(browser: Browser, base_url: str, key: str) -> None:
     context = browser.new_context(base_url=base_url)
     page = context.new_page()

@@ -9,13 +9,12 @@ from urllib.parse import urlsplit
 
 import pytest
 from astropy.io import fits
-from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, Page, expect
 from sqlalchemy import create_engine, delete
 
 from tests.conftest import write_image
 from tests.service.pages.browser.checks import good
-from tests.service.pages.browser.conftest import LONG_MS, MARK, NOT_RELOADED, Site, Submit, Watch, logged_in
+from tests.service.pages.browser.conftest import LONG_MS, MARK, NOT_RELOADED, Site, Submit, logged_in
 from tests.service.pages.browser.products import Looked, made
 from tests.whole.stack import wait_for
 from workers.catalogue.tables import ImageRow
@@ -82,16 +81,6 @@ def test_title_download_and_blink_need_no_scrolling(page: Page, product: Looked)
         expect(page.locator("#tag-left")).to_have_text(re.compile("before|after"))
 
 
-def test_a_deleted_product_leaves_its_image(page: Page, site: Site, product: Looked, watch: Watch) -> None:
-    page.goto(product.page)
-    page.get_by_text("Delete this product").click()
-    page.get_by_role("button", name="Delete", exact=True).click()
-    expect(page).to_have_url(f"{site.client.server}/images/{product.image_id}")
-    watch.allowed.append("404")
-    page.goto(product.page)
-    expect(page.get_by_role("alert")).to_be_visible()
-
-
 def test_a_product_whose_image_was_deleted_is_shown_alone(page: Page, site: Site, product: Looked) -> None:
     engine = create_engine(Settings(data_dir=site.data, database_url=None).catalogue_url)
     with engine.begin() as connection:
@@ -99,13 +88,6 @@ def test_a_product_whose_image_was_deleted_is_shown_alone(page: Page, site: Site
     engine.dispose()
     page.goto(product.page)
     expect(page.locator("main")).to_contain_text("The uploaded image was deleted")
-    shown_alone(page)
-
-
-def test_a_product_whose_upload_is_lost_is_shown_alone(page: Page, site: Site, product: Looked) -> None:
-    remove_file(site, product.image_id)
-    page.goto(product.page)
-    expect(page.get_by_role("alert")).to_contain_text("The file of the uploaded image is lost")
     shown_alone(page)
 
 
@@ -119,21 +101,6 @@ def shown_alone(page: Page) -> None:
     expect(page.locator('[data-value="before"]')).to_have_text("not there")
     expect(page.locator('[data-value="after"]')).to_contain_text("DN/s")
     expect(page.locator("#change-row")).to_have_count(0)
-
-
-def remove_file(site: Site, digest: str) -> None:
-    """Lose a stored file."""
-    [stored] = (site.data / "blobs").rglob(f"{digest}*")
-    stored.unlink()
-
-
-def test_a_lost_file_is_told(page: Page, site: Site, product: Looked) -> None:
-    remove_file(site, site.client.get(f"/v1/products/{product.id}")["sha256"])
-    page.goto(product.page)
-    expect(page.get_by_role("alert")).to_contain_text("The file of this product is lost.")
-    expect(page.locator("#viewer")).to_have_count(0)
-    expect(page.locator("img.picture")).to_be_visible()
-    assert Axe().run(page).violations_count == 0
 
 
 # --- jobs ------------------------------------------------------------------------------------------------

@@ -159,14 +159,6 @@ def test_a_folder_is_checked_and_then_sent(page: Page, tmp_path: Path) -> None:
     expect(page.get_by_role("heading", level=1)).to_have_text("mercury.tar")
 
 
-def test_the_header_of_an_image_is_searched(page: Page) -> None:
-    page.goto("/")
-    page.get_by_role("button", name="Use the sample image").click()
-    page.get_by_label("Search the header").fill("wavelnth")
-    expect(page.get_by_role("cell", name="174", exact=True)).to_be_visible()
-    expect(page.get_by_role("rowheader", name="TELESCOP")).to_have_count(0)
-
-
 def tab_to(page: Page, place: Locator) -> None:
     """Press the tabulator key until a place has the focus."""
     for _ in range(MOST_TABS):
