@@ -32,6 +32,7 @@ from workers.bulk.listing import MOST_IMAGES
 from workers.bulk.runs import KIND, MOST_TURNS, begin, keep_turns
 from workers.bulk.task import TELL_EVERY_S
 from workers.contract.bulk import AT_WORK, BulkRequest
+from workers.contract.jobs import Queue
 from workers.machine import cores
 from workers.settings import Settings
 
@@ -189,7 +190,7 @@ def measure() -> dict[str, Any]:
             (turn,) = (job for job in catalogue.jobs.of_kind(KIND) if job.parameters["bulk_id"] == bulk.id)
             run: BulkRow | None = bulk
             while run is not None and run.phase in AT_WORK:  # a long turn is handed back
-                Runner(settings, catalogue, service.store).run(turn.id)
+                Runner(settings, catalogue, service.store).run_next(turn.id, Queue(turn.queue))
                 run = catalogue.bulks.get(bulk.id)
             spent[name] = counted["statements"]
             assert run is not None and run.done == images, (run.done, run.failed, run.error)

@@ -16,6 +16,7 @@ from fastapi.testclient import TestClient
 from service.cli.main import main
 from tests.conftest import write_image
 from tests.service.conftest import refusal, upload
+from tests.workers.jobs import run_job
 from workers.bulk.runs import keep_turns
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ImageRow
@@ -54,7 +55,7 @@ def work(catalogue: Catalogue, settings: Settings) -> None:
     runner = Runner(settings, catalogue, Store(settings.data_dir))
     keep_turns(catalogue, settings)
     for turn in catalogue.jobs.of_kind("bulk"):
-        runner.run(turn.id)
+        run_job(runner, catalogue, turn.id)
 
 
 def test_an_upload_over_the_quota_is_refused_with_figures(
@@ -101,7 +102,7 @@ def test_jobs_that_were_queued_while_there_was_room_end_where_there_is_none(
     runner = Runner(settings, catalogue, Store(settings.data_dir))
     jobs = {}
     for job_id in (first, second, equal, tables):
-        runner.run(job_id)
+        run_job(runner, catalogue, job_id)
         jobs[job_id] = api.get(f"/v1/jobs/{job_id}").json()
     error = jobs[second]["error"]
     assert (jobs[second]["phase"], error["code"], error["fault"]) == ("ERROR", "quota-exceeded", "user")

@@ -85,6 +85,13 @@ def test_a_cancelled_job_is_not_handed_back(bench: Bench) -> None:
     assert (row.phase, row.result_id) == (Phase.ABORTED, None)
 
 
+def test_a_job_that_takes_too_long_ends_at_its_next_report(bench: Bench) -> None:
+    row = bench.run(steps_for(60.0), max_job_s=0.05)
+    assert row.phase == Phase.ERROR and row.error is not None
+    assert (row.error["code"], row.error["fault"]) == ("took-too-long", "user")
+    assert "0.05 s (HELIOPSF_MAX_JOB_S)" in row.error["message"]
+
+
 # Heartbeats -----------------------------------------------------------------------------------------
 
 
@@ -101,7 +108,7 @@ def test_a_heartbeat_that_failed_is_followed_by_another() -> None:
         return True
 
     catalogue = SimpleNamespace(jobs=SimpleNamespace(heartbeat=heartbeat))
-    attempt = Attempt(catalogue, Lease("job", "token"), 0.01, Stopping(), None, limit_s=60.0)  # type: ignore[arg-type]
+    attempt = Attempt(catalogue, Lease("job", "token"), 0.01, Stopping(), limit_s=60.0)  # type: ignore[arg-type]
     with attempt.beating():
         assert third.wait(10.0), beats
     assert not attempt.stopped.is_set()
@@ -111,7 +118,7 @@ def test_a_heartbeat_that_failed_is_followed_by_another() -> None:
 
 DEAF = worker_of("""
 def task(context, _):
-    context.report("at work", 2, 2)
+    context.report("at work", 1, 2)
     time.sleep(60)
 """)
 
