@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import pytest
 from pydantic import TypeAdapter
 
 from psfcore.files import sha256_of
@@ -18,6 +21,7 @@ from psfcore.transit.archive import list_archive, pack
 from service.client.operations import Operations, Progress
 from service.client.outputs import written
 from service.views import JobView, ProductView, PsfView, ReportView
+from tests.workers.jobs import run_job
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, ProductRow, PsfRow, ReportRow
 from workers.contract.jobs import Phase
@@ -27,10 +31,26 @@ from workers.intake.compatibility import details_now
 from workers.intake.requests import resolve
 from workers.intake.uploads import image_row, transit_row, uploaded_psf_row
 from workers.rows import row_of
+from workers.run.attempt import Attempt
 from workers.run.runner import Runner
 from workers.settings import Settings
 
 _TABLES: dict[str, Any] = {"products": ProductRow, "reports": ReportRow, "psfs": PsfRow}
+
+
+@contextmanager
+def _reports_to(progress: Progress | None) -> Iterator[None]:
+    """Pass on what tasks report while the block runs."""
+    report = Attempt.report
+
+    def also_tell(attempt: Attempt, stage: str, step: int, steps: int) -> None:
+        report(attempt, stage, step, steps)
+        if progress is not None:
+            progress(stage, step, max(steps, 1))
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(Attempt, "report", also_tell)
+        yield
 
 
 class InProcess(Operations):
@@ -93,7 +113,8 @@ class InProcess(Operations):
 
     def wait(self, job: dict[str, Any], *, progress: Progress | None = None) -> dict[str, Any]:
         while not Phase(job["phase"]).ended:
-            self._runner.run(job["id"], progress)
+            with _reports_to(progress):
+                run_job(self._runner, self.catalogue, job["id"])
             row = self.catalogue.jobs.get(job["id"])
             assert row is not None
             job = JobView.of(row).model_dump(mode="json")

@@ -48,8 +48,8 @@ class Settings(BaseSettings):
     quota_mib: int = Field(
         0,
         ge=0,
-        description="largest size of an owner's stored files, MiB; each MiB also allows 256 database rows without a file, such as "
-        "jobs and images of bulk runs; 0: unlimited; `heliopsf store quota` sets another limit for an owner",
+        description="largest size of an owner's stored files, MiB; 0: unlimited; `heliopsf store quota` sets another limit for an "
+        "owner",
     )
     keep_days: str = Field(
         "",

@@ -94,7 +94,7 @@ def prepared(body: JobRequest, caller: Caller, state: Shared) -> tuple[dict[str,
 
     Raises ``Problem`` if the request cannot be accepted.
     """
-    check_room(state, caller.owner, more_rows=1)
+    check_room(state, caller.owner)
     parameters, identity = _resolved(body, caller, state)
     with as_problems():
         estimate = estimates.checked(body.kind, parameters, state.catalogue, caller.owner, state.settings)

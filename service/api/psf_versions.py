@@ -14,7 +14,6 @@ from service.api.psfs import TEXT
 from service.http.callers import Caller, Certifying, KeyFirst, Reading
 from service.http.paging import Page, Paging, finite, identity, place
 from service.http.problems import RESPONSES, as_problems
-from service.http.quotas import check_rows
 from service.http.state import Shared, State
 from service.views import PastChange, RowView, was_certified
 from workers.catalogue.affected import Affected, Place
@@ -132,9 +131,6 @@ def change_psf_status(psf_id: Identity, body: StatusChange, caller: Certifying, 
     The time ranges of the certified PSFs of a series must not overlap. If the range in the request overlaps the range
     of another certified PSF, the answer is 409; the message names this PSF.
     """
-    # A deprecation is never refused for the quota, because a wrong PSF must not stay certified.
-    if body.status == PsfStatus.CERTIFIED:
-        check_rows(state, caller.owner)
     with as_problems():
         row = state.catalogue.psfs.change(psf_id, caller.owner, _asked(body), caller.name)
     log.info("PSF %s: %s, version %s, by %s", row.id, row.status, row.version, caller.name)
@@ -233,7 +229,6 @@ def change_series(
     PSFs. Both PSFs must have been fitted with the same shape and the same diffraction PSF. Existing contexts do not change.
     """
     name = f"{instrument}/{channel}/{kind}"
-    check_rows(state, caller.owner)
     with as_problems():
         state.catalogue.series.set_interpolated(
             name, caller.owner, body.interpolated, caller.name, body.reason
@@ -405,7 +400,6 @@ class DefaultView(BaseModel):
 )
 def create_context(body: ContextAsked, response: Response, caller: Certifying, state: Shared) -> WholeContext:
     """Pin PSFs under a name: the given PSFs, or all PSFs that are certified now."""
-    check_rows(state, caller.owner, 1 + len(body.pins or ()))
     with as_problems():
         pins = None if body.pins is None else [Pin(pin.psf_id, _range(pin)) for pin in body.pins]
         row, new = state.catalogue.contexts.create(
@@ -438,7 +432,6 @@ def get_default_context(caller: Reading, state: Shared) -> DefaultView:
 @contexts.put("/default", summary="Change the default context")
 def move_default_context(body: DefaultAsked, caller: Certifying, state: Shared) -> DefaultView:
     """Set the default context. If `context` is null, there is no default. The history of changes is kept."""
-    check_rows(state, caller.owner)
     with as_problems():
         state.catalogue.contexts.set_default(body.context, caller.owner, caller.name, body.reason)
     return get_default_context(caller, state)

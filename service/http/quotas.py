@@ -1,4 +1,4 @@
-"""Checks the storage quota of an owner before an upload is received, before a job is accepted, and when rows are added.
+"""Checks the storage quota of an owner before an upload is received, and before a job is accepted.
 
 The declared lengths of the owner's open resumable uploads count as used.
 """
@@ -16,7 +16,7 @@ from service.http.rates import Bucket
 from service.http.state import State
 from workers import checks
 from workers.catalogue.catalogue import Row
-from workers.catalogue.owners import MIB, NOT_KEPT, ROWS_NOT_KEPT, OverQuota, Usage
+from workers.catalogue.owners import MIB, NOT_KEPT, OverQuota, Usage
 from workers.files.partial_uploads import PartialUploads
 from workers.files.store import STORAGE_FULL
 
@@ -81,26 +81,12 @@ def check_disk(state: State, more_bytes: int = 0) -> None:
         )
 
 
-def check_room(state: State, owner: str, more_rows: int = 0) -> None:
-    """Raise ``Problem`` 507 if the owner's quota or the disk is full, because no result could be stored.
-
-    more_rows: as for ``check_rows``.
-    """
+def check_room(state: State, owner: str) -> None:
+    """Raise ``Problem`` 507 if the owner's quota or the disk is full, because no result could be stored."""
     check_disk(state)
     usage = _limited(state, owner)
     if usage is not None and usage.full:
         raise _exceeded(507, usage, usage.no_room(NOT_KEPT))
-    _check_rows(usage, more_rows)
-
-
-def check_rows(state: State, owner: str, more_rows: int = 1) -> None:
-    """Raise ``Problem`` 507 if the owner's quota does not allow this many more database rows without a file."""
-    _check_rows(_limited(state, owner), more_rows)
-
-
-def _check_rows(usage: Usage | None, more_rows: int) -> None:
-    if usage is not None and not usage.allows_rows(more_rows):
-        raise _exceeded(507, usage, usage.too_many_rows(ROWS_NOT_KEPT))
 
 
 def _limited(state: State, owner: str, but: str | None = None) -> Usage | None:

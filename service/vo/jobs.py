@@ -19,7 +19,6 @@ from fastapi.responses import PlainTextResponse, RedirectResponse
 from service.api.jobs import check_own, find
 from service.http.callers import Caller, Reading, Submitting
 from service.http.problems import Problem, problem
-from service.http.quotas import check_rows
 from service.http.state import Shared, State
 from service.views import time_left_s
 from service.vo import job_documents as documents
@@ -152,7 +151,6 @@ def create_uws_job(caller: Submitting, sent: SentForm, request: Request, state: 
     files = files_of(sent, kind)
     form |= ids_of(files)
     check(kind, form)
-    check_rows(state, caller.owner)
     keep(state, caller, files)
     ready = resolved(state, caller.owner, kind, form) if start else None
     row = state.catalogue.uws.draft(

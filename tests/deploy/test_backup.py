@@ -22,6 +22,7 @@ from service.cli.main import main
 from tests.conftest import write_image, write_psf
 from tests.service.conftest import upload
 from tests.whole.stack import Missing, postgres_database
+from tests.workers.jobs import run_job
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow
 from workers.contract.jobs import Phase
@@ -131,5 +132,5 @@ def run_jobs(settings: Settings) -> None:
     catalogue = Catalogue(settings.catalogue_url)
     runner = Runner(settings, catalogue, Store(settings.data_dir))
     for row in catalogue.page(JobRow, owner=DEFAULT_OWNER, limit=10, phase=Phase.QUEUED):
-        runner.run(row.id)
+        run_job(runner, catalogue, row.id)
     catalogue.close()

@@ -35,10 +35,12 @@ DEPLOY = Path(__file__).parents[2] / "deploy"
 
 def resources(folder: Path) -> list[dict[str, Any]]:
     """The manifests that the kustomization in a folder names, and those of the folders that it names, without its patches."""
-    named = yaml.safe_load((folder / "kustomization.yaml").read_text("utf-8"))["resources"]
+    kustomization = yaml.safe_load((folder / "kustomization.yaml").read_text("utf-8"))
     found: list[dict[str, Any]] = []
-    for path in (folder / name for name in named):
+    for path in (folder / name for name in kustomization["resources"]):
         found += resources(path) if path.is_dir() else yaml.safe_load_all(path.read_text("utf-8"))
+    for one in found:
+        one["metadata"]["name"] += kustomization.get("nameSuffix", "")
     return found
 
 
@@ -75,7 +77,7 @@ def test_a_unit_runs_a_command_that_exists_with_settings_that_exist() -> None:
 
 
 def test_the_units_differ_only_in_what_they_run() -> None:
-    """Whoever hardens one unit must harden the other."""
+    """Whoever hardens one unit must harden the others."""
     own = {"Description", "ExecStart", "Environment", "TimeoutStopSec", "UMask", "MemoryMax"}
     kept = []
     for unit in UNITS:
@@ -86,7 +88,7 @@ def test_the_units_differ_only_in_what_they_run() -> None:
         for section in kept[-1].values():
             for key in own & set(section):
                 del section[key]
-    assert len(kept) == 2 and kept[0] == kept[1]
+    assert len(kept) == 3 and kept[0] == kept[1] == kept[2]
 
 
 def test_systemd_accepts_the_units_and_finds_them_guarded(tmp_path: Path) -> None:

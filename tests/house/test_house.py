@@ -232,6 +232,9 @@ def test_no_file_names_a_registry() -> None:
     assert named == []
 
 
+OURS = ("api", "worker", "worker-interactive")  # the services of the Compose file that run heliopsf
+
+
 def test_the_compose_file_fits_the_settings_and_the_commands() -> None:
     """As far as can be checked without an engine: every variable is a setting, every command exists."""
     from click.testing import CliRunner
@@ -241,18 +244,18 @@ def test_the_compose_file_fits_the_settings_and_the_commands() -> None:
 
     compose = yaml.safe_load((HERE / "docker-compose.yml").read_text())
     services = compose["services"]
-    assert set(services) == {"proxy", "api", "worker", "redis", "postgres"}
+    assert set(services) == {"proxy", *OURS, "redis", "postgres"}
     known = {f"HELIOPSF_{name.upper()}" for name in Settings.model_fields}
     for name, service in services.items():
         assert service["healthcheck"]["test"], name
         mounts = {f"{v}:{p}" for v in compose["volumes"] for p in ("/data", "/var/lib/postgresql/data")}
         assert set(service.get("volumes", [])) <= mounts | {"./deploy/nginx.conf:/etc/nginx/nginx.conf:ro"}
-        if name in ("api", "worker"):
+        if name in OURS:
             assert set(service["environment"]) <= known
             assert set(service["depends_on"]) == {"redis", "postgres"}
             command = service["command"].split()
             assert command[0] == "heliopsf"
-            assert CliRunner().invoke(main, [command[1], "--help"]).exit_code == 0
+            assert CliRunner().invoke(main, [*command[1:], "--help"]).exit_code == 0
     assert services["proxy"]["ports"][0].startswith("127.0.0.1:"), "reachable from this machine alone"
 
 
@@ -269,7 +272,7 @@ def test_the_containers_have_no_more_rights_and_memory_than_they_need() -> None:
     password = "${REDIS_PASSWORD:?set REDIS_PASSWORD in .env}"
     assert services["redis"]["command"].endswith(f"--requirepass {password}")
     assert services["redis"]["environment"]["REDISCLI_AUTH"] == password
-    for name in ("api", "worker"):
+    for name in OURS:
         assert f"redis://:{password}@redis:" in services[name]["environment"]["HELIOPSF_BROKER_URL"], name
         assert "/tmp" in services[name]["tmpfs"], name
         assert "JOB_MEMORY_MIB" in services[name]["environment"]["HELIOPSF_MAX_JOB_MEMORY_MIB"], name

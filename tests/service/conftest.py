@@ -21,6 +21,7 @@ from tests.service.keyed import Keyed, keyed
 from tests.shared_routes import shared_routes
 from tests.tables import copied_tables
 from tests.transit_files import write_transit
+from tests.workers.jobs import run_job
 from workers.bulk.runs import keep_turns
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.contexts import Pin
@@ -110,7 +111,7 @@ def run_jobs(settings: Settings, api: TestClient) -> Callable[[], None]:
         catalogue = Catalogue(settings.catalogue_url)
         runner = Runner(settings, catalogue, Store(settings.data_dir))
         for row in catalogue.page(JobRow, owner=DEFAULT_OWNER, limit=100, phase=Phase.QUEUED):
-            runner.run(row.id)
+            run_job(runner, catalogue, row.id)
         catalogue.close()
 
     return run
@@ -135,7 +136,7 @@ def work_through_bulks(settings: Settings) -> None:
     while catalogue.bulks.at_work():
         keep_turns(catalogue, settings)
         for turn in catalogue.jobs.of_kind("bulk"):
-            runner.run(turn.id)
+            run_job(runner, catalogue, turn.id)
     catalogue.close()
 
 

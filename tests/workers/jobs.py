@@ -14,6 +14,7 @@ from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
 from workers.catalogue.tables import DEFAULT_OWNER, BulkRow, JobRow
 from workers.contract.bulk import BulkPhase
+from workers.contract.jobs import Queue
 from workers.files.store import Store
 from workers.run.child import Stopping
 from workers.run.runner import Runner
@@ -37,6 +38,11 @@ def claimed(catalogue: Catalogue, job_id: str, worker: str = "w") -> Lease:
     return lease
 
 
+def run_job(runner: Runner, catalogue: Catalogue, job_id: str) -> None:
+    """Let a runner take the message of a job."""
+    runner.run_next(job_id, Queue(job_row(catalogue, job_id).queue))
+
+
 def bulk_row(owner: str, key: str = "k", *, listed: bool = True, **values: Any) -> BulkRow:
     """A bulk run that is at work; listed: whether all of its files are listed."""
     known = {
@@ -55,13 +61,17 @@ class Bench:
         self._settings = Settings(data_dir=folder / "data", heartbeat_s=0.05, broker_url="filesystem://")
         self._monkeypatch = monkeypatch
 
-    def run(self, task: Task, on_progress: Callable[[str, int, int], None] | None = None) -> JobRow:
-        """The row of a job of this task after one attempt; a job that was handed back gets another attempt."""
+    def run(self, task: Task, **changes: Any) -> JobRow:
+        """The row of a job of this task after one attempt; a job that was handed back gets another attempt.
+
+        changes: further settings of the worker.
+        """
         self._monkeypatch.setattr("workers.tasks.psf_build.psf_build", task)
         job, _ = self.catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)
         self.catalogue.jobs.mark_submitted(job.id)
-        store = Store(self._settings.data_dir)
-        Runner(self._settings, self.catalogue, store, stopping=self.stopping).run(job.id, on_progress)
+        settings = self._settings.model_copy(update=changes)
+        runner = Runner(settings, self.catalogue, Store(settings.data_dir), stopping=self.stopping)
+        run_job(runner, self.catalogue, job.id)
         return job_row(self.catalogue, job.id)
 
 

@@ -18,6 +18,7 @@ from fastapi.testclient import TestClient
 from psfcore.errors import MissingExtra
 from service.app import create_app
 from tests.service.conftest import upload
+from tests.workers.jobs import run_job
 from workers import traces
 from workers.catalogue.catalogue import Catalogue
 from workers.files.store import Store
@@ -110,9 +111,9 @@ def test_requests_and_jobs_arrive_at_the_collector(tmp_path: Path, image_file: P
             job = api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": ids | few}).json()["id"]
             api.get(f"/v1/jobs/{job}", headers={"traceparent": CLIENT, "X-Request-ID": "abc"})
             catalogue = Catalogue(settings.catalogue_url)
-            Runner(settings, catalogue, Store(settings.data_dir)).run(job)
+            run_job(Runner(settings, catalogue, Store(settings.data_dir)), catalogue, job)
             failing, _ = catalogue.jobs.submit("deconvolve", {"image_id": "x"}, "k", "local")
-            Runner(settings, catalogue, Store(settings.data_dir)).run(failing.id)
+            run_job(Runner(settings, catalogue, Store(settings.data_dir)), catalogue, failing.id)
             catalogue.close()
         found = spans()
     assert {one["part"] for one in found} == {"heliopsf-server"}

@@ -1,9 +1,8 @@
-"""Statuses, version numbers, ranges and steps of time, and variants of a channel, without a database."""
+"""Version numbers, ranges and steps of time, and variants of a channel, without a database."""
 
 from __future__ import annotations
 
 import math
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -13,11 +12,8 @@ from psfcore.errors import DataError
 from workers.versions import (
     FEWEST_STEPS,
     LONGEST_STEP_S,
-    MAY_BECOME,
-    PsfStatus,
     Validity,
     channel_of,
-    check_transition,
     check_version,
     interpolated_time,
     is_variant_of,
@@ -29,26 +25,6 @@ from workers.versions import (
     without_variant,
     word,
 )
-
-DRAFT, CERTIFIED, DEPRECATED = PsfStatus
-ALLOWED = {
-    (DRAFT, CERTIFIED),
-    (CERTIFIED, CERTIFIED),
-    (CERTIFIED, DEPRECATED),
-    (DEPRECATED, DEPRECATED),
-}
-
-
-def test_allowed_and_refused_changes_of_status() -> None:
-    for before, after in product(PsfStatus, PsfStatus):
-        if (before, after) in ALLOWED:
-            check_transition(before, after)
-            continue
-        with pytest.raises(DataError, match=f"expected status .* for a {before} PSF; got {after}") as caught:
-            check_transition(before, after)
-        assert caught.value.code == "wrong-transition"
-        assert all(state in caught.value.message for state in MAY_BECOME[before])
-
 
 # Released versions, and the next one. That of an interpolated PSF, which is deprecated with its ends, does not count.
 NEXT: tuple[tuple[list[str], str], ...] = (

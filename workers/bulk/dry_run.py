@@ -13,7 +13,6 @@ import random
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 from pydantic import BaseModel, Field
 
@@ -21,7 +20,7 @@ from psfcore.errors import DataError
 from psfcore.fits.blocks import BLOCK_BYTES, FitsLimits
 from psfcore.fits.header import read_summary
 from workers.bulk.listing import found_files, no_images
-from workers.bulk.outputs import target_of
+from workers.bulk.outputs import Source, target_of
 from workers.bulk.runs import new_run, resolved_image
 from workers.catalogue.bulks import Listed
 from workers.catalogue.catalogue import Catalogue
@@ -166,15 +165,16 @@ class _DryRun:
         if image.error is not None:
             raise DataError(image.error.code, image.error.message)
         catalogue = self._catalogue
-        image_id, summary = self._summary(image)
-        resolved = resolved_image(self._run, image_id, summary, catalogue)
-        needs = resolved.model_dump(mode="json") | {"image_shape": summary["shape"]}
+        source = self._source(image)
+        resolved = resolved_image(self._run, source.sha256, source.summary, catalogue)
+        shape = source.summary["shape"]
+        needs = resolved.model_dump(mode="json") | {"image_shape": shape}
         estimate = estimates.checked("deconvolve", needs, catalogue, self._run.owner, self._settings)
         exists = image.uploaded and (
             catalogue.get(ProductRow, product_identity(resolved), self._run.owner) is not None
         )
         if self._request.output is not None:
-            target = self._target(image, summary, resolved)
+            target = self._target(image, source, resolved)
             # The id of a file's product depends on the bytes of the file.
             if image.uploaded or "{product}" not in (self._request.output.layout or "{product}"):
                 self._example_output = self._example_output or archive_files.shown(target)
@@ -183,18 +183,16 @@ class _DryRun:
         if not exists:
             start_s = estimate["start_s"]
             self._seconds += start_s * estimates.factor(estimates.BULK, start_s, catalogue)
-            self._bytes += product_bytes(summary["shape"], resolved.error_draws)
+            self._bytes += product_bytes(shape, resolved.error_draws)
 
-    def _target(self, image: Listed, summary: dict[str, Any], resolved: ResolvedDeconvolve) -> Path:
+    def _target(self, image: Listed, source: Source, resolved: ResolvedDeconvolve) -> Path:
         """The path of the product. Raises DataError if the layout gives no name, or the name of another examined image."""
         assert self._request.output is not None
         identity = product_identity(resolved)
         target = target_of(
             self._request.output,
             self._settings,
-            name=summary["filename"] if image.uploaded else Path(image.source).name,
-            source=None if image.uploaded else Path(image.source),
-            summary=summary,
+            source,
             identity=identity if image.uploaded else hashlib.sha256(image.source.encode()).hexdigest(),
             psf_id=resolved.psf_id,
         )
@@ -207,16 +205,15 @@ class _DryRun:
             )
         return target
 
-    def _summary(self, image: Listed) -> tuple[str, dict[str, Any]]:
+    def _source(self, image: Listed) -> Source:
         if image.uploaded:
             row = row_of(self._catalogue, ImageRow, image.source, self._run.owner)
-            return row.id, row.summary | {"filename": row.filename or "image"}
+            return Source(row.id, row.summary, row.filename or "image")
+        path, limits = Path(image.source), FitsLimits(max_pixels=self._settings.max_pixels)
         try:
-            with archive_files.opened(
-                Path(image.source), archive_files.roots(self._settings.bulk_roots)
-            ) as file:
-                limits = FitsLimits(max_pixels=self._settings.max_pixels)
-                return NO_ID, dataclasses.asdict(read_summary(archive_files.reopened(file), limits))
+            with archive_files.opened(path, archive_files.roots(self._settings.bulk_roots)) as file:
+                summary = dataclasses.asdict(read_summary(archive_files.reopened(file), limits))
+                return Source(NO_ID, summary, path.name, path)
         except OSError as error:
             raise archive_files.unreadable(error) from error
 

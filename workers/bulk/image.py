@@ -73,20 +73,6 @@ class Ready:
     start_s: float
 
 
-@dataclass(frozen=True)
-class _Source:
-    """An image of a bulk run: its file and the summary of its header.
-
-    name: the file name of the product is made from this name.
-    """
-
-    copy: Path | None  # the copy of an archive file; None for an upload, which is in the store
-    path: Path | None  # the path of an archive file; None for an upload
-    sha256: str
-    summary: dict[str, Any]
-    name: str
-
-
 def read_one(context: Context, bulk: BulkRow, item: BulkItemRow) -> Ready | Outcome:
     """Read an image of a bulk run and choose its PSF. If its product exists already, return this product.
 
@@ -98,15 +84,7 @@ def read_one(context: Context, bulk: BulkRow, item: BulkItemRow) -> Ready | Outc
         request = resolved_image(bulk, source.sha256, source.summary, context.catalogue)
         identity, target = product_identity(request), None
         if run.output is not None:
-            target = outputs.target_of(
-                run.output,
-                settings,
-                name=source.name,
-                source=source.path,
-                summary=source.summary,
-                identity=identity,
-                psf_id=request.psf_id,
-            )
+            target = outputs.target_of(run.output, settings, source, identity=identity, psf_id=request.psf_id)
             if item.attempts > 1:
                 outputs.remove_partials(target, settings)
         destination = Destination(identity, run, target)
@@ -171,10 +149,10 @@ def _rest() -> None:
 
 
 @contextmanager
-def _source(context: Context, item: BulkItemRow) -> Iterator[_Source]:
+def _source(context: Context, item: BulkItemRow) -> Iterator[outputs.Source]:
     if item.uploaded:
         row = row_of(context.catalogue, ImageRow, item.source, context.owner)
-        yield _Source(None, None, row.id, row.summary, row.filename or "image")
+        yield outputs.Source(row.id, row.summary, row.filename or "image")
         return
     allowed = archive_files.roots(context.settings.bulk_roots)
     path = archive_files.check_under(Path(item.source), allowed)
@@ -187,7 +165,7 @@ def _source(context: Context, item: BulkItemRow) -> Iterator[_Source]:
                 raise
             raise archive_files.unreadable(error) from error
         summary = dataclasses.asdict(read_summary(copy, context.limits))
-        yield _Source(copy, path, sha256, summary, path.name)
+        yield outputs.Source(sha256, summary, path.name, path, copy)
 
 
 def done_before(context: Context, destination: Destination) -> Outcome | None:

@@ -31,7 +31,6 @@ LIST_AT_ONCE = 200
 ADD_EVERY_S = (
     0.5  # images are added after this time even if they are fewer, so that the first ones are processed soon
 )
-NOT_LISTED = "not all files that the patterns match could be listed"  # a reason for Usage.too_many_rows
 
 
 @dataclass(frozen=True)
@@ -97,9 +96,6 @@ def _add_all(context: Context, bulk: BulkRow, added: Callable[[], None], stops: 
         add_at = time.monotonic() + ADD_EVERY_S
         if place is None:
             return True
-        usage = context.catalogue.owners.limited(context.owner, context.settings.quota_mib)
-        if usage is not None and not usage.allows_rows(len(batch)):
-            raise DataError("quota-exceeded", f"{usage.too_many_rows(NOT_LISTED)}, then resume the run")
         if not bulks.add_listed(bulk.id, lease, batch, place.stored()):
             return False
         batch.clear()

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -18,28 +19,33 @@ from workers.settings import Settings
 from workers.versions import seconds
 
 
-def target_of(
-    output: Output,
-    settings: Settings,
-    *,
-    name: str,
-    source: Path | None,
-    summary: Mapping[str, Any],
-    identity: str,
-    psf_id: str,
-) -> Path:
-    """The path of a product. name: file name of the image. source: path of its file; None for an upload. identity: id
-    of the product.
+@dataclass(frozen=True)
+class Source:
+    """An image of a bulk run: its SHA-256, the summary of its header, and its file name.
+
+    path: the path of a file of the archive; None for an upload. copy: a copy of this file, if it was made.
+    """
+
+    sha256: str
+    summary: dict[str, Any]
+    name: str
+    path: Path | None = None
+    copy: Path | None = None
+
+
+def target_of(output: Output, settings: Settings, source: Source, *, identity: str, psf_id: str) -> Path:
+    """The path of a product. identity: id of the product.
 
     Raises DataError "path-not-allowed", "bad-path", and "no-output-name" if the layout cannot name this image.
     """
     folder = archive_files.check_under(Path(output.folder), _roots(settings), "an output folder")
     if output.layout is None:
-        return folder / archive_files.safe_name(name, identity)
+        return folder / archive_files.safe_name(source.name, identity)
+    summary = source.summary
     taken_at = None if summary["date_obs"] is None else seconds(summary["date_obs"])
     values: dict[str, FieldValue] = {
-        "stem": archive_files.stem_of(name),
-        "folder": _folder_below(source, archive_files.roots(settings.bulk_roots)),
+        "stem": archive_files.stem_of(source.name),
+        "folder": _folder_below(source.path, archive_files.roots(settings.bulk_roots)),
         "date": None if taken_at is None else datetime.fromtimestamp(taken_at, UTC),
         "wavelnth": None if summary["wavelnth"] is None else f"{summary['wavelnth']:g}",
         "product": identity[:16],

@@ -21,11 +21,12 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeVar
 
+from psfcore.errors import DataError
 from workers.bulk.image import Destination, Outcome, Ready, compute_one, done_before, read_one, write_one
 from workers.bulk.listing import list_files
 from workers.catalogue.tables import BulkItemRow, BulkRow
 from workers.contract.bulk import AT_WORK, BulkPhase, BulkWork
-from workers.contract.jobs import Fault, JobError
+from workers.contract.jobs import JobError
 from workers.stage_timer import STARTING
 from workers.tasks.context import Context, TurnOver
 from workers.tasks.deconvolve import Made
@@ -133,13 +134,8 @@ class _Turn:
             return False
         if not BulkWork.model_validate(self._bulk.request).keeps_products:
             return False
-        message = (
-            f"expected room for more products; {usage.used_bytes} of {usage.limit_bytes} bytes of the quota are used: delete "
-            "products that you no longer need (`heliopsf product delete`), or ask the operator for a larger quota; then "
-            "resume the run"
-        )
-        error = JobError(fault=Fault.USER, code="quota-exceeded", message=message)
-        self._bulks.stop_with(self._bulk.id, error)
+        message = f"{usage.no_room('no further product could be kept')}, then resume the run"
+        self._bulks.stop_with(self._bulk.id, JobError.of(DataError("quota-exceeded", message)))
         return True
 
     # Listing ------------------------------------------------------------------------------------------

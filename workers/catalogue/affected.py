@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
-from sqlalchemy import Select, exists, select, union_all
+from sqlalchemy import Select, exists, select
 from sqlalchemy.orm import Session
 
 from workers.catalogue.database import Queries, newest_first
@@ -66,7 +67,8 @@ class AffectedProducts(Queries):
                 psfs = session.scalars(_next_psfs(owner, superseded, done)).all()
                 if not psfs:
                     break
-                affected += _affected(session, psfs, _first_products(session, psfs, limit - len(affected)))
+                rows = (session.scalars(_products(psf, limit - len(affected))) for psf in psfs)
+                affected += _affected(session, psfs, list(chain.from_iterable(rows)))
                 done = psfs[-1].id
         return affected[:limit]
 
@@ -86,18 +88,6 @@ def _products(psf: PsfRow, limit: int, after: tuple[float, str] | None = None) -
     """Products of a PSF, newest first."""
     query = select(ProductRow).where(ProductRow.owner == psf.owner, ProductRow.psf_id == psf.id)
     return newest_first(query, ProductRow, limit, after)
-
-
-def _first_products(session: Session, psfs: Sequence[PsfRow], limit: int) -> list[ProductRow]:
-    """The first products of these PSFs, from one statement.
-
-    They are sorted in the order of ``psfs``; the products of each PSF are sorted newest first.
-    """
-    each = [select(_products(psf, limit).subquery()) for psf in psfs]
-    rows = session.scalars(select(ProductRow).from_statement(union_all(*each))).all()
-    place = {psf.id: number for number, psf in enumerate(psfs)}
-    # The order of the rows of a union is not guaranteed.
-    return sorted(rows, key=lambda row: (-place[row.psf_id], row.created_at, row.id), reverse=True)
 
 
 def _affected(session: Session, psfs: Sequence[PsfRow], products: Sequence[ProductRow]) -> list[Affected]:

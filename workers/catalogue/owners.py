@@ -1,14 +1,10 @@
 """The files to which rows refer, and the quota of each owner.
 
-The quota limits the bytes of the files that the owner keeps, and the number of database rows without a file.
+The quota limits the bytes of the files that the owner keeps.
 
 The files of the owner's uploads, PSFs, products, reports and kept solutions count; their pictures do not. The sums are
 read from the rows, so they are always exact. A transaction that adds a file under a quota first locks the owner's
 row; therefore two transactions cannot use the same room.
-
-Jobs, bulk runs with their images, contexts with their pins, and changes of PSFs, series and default contexts have no
-file. Their number is limited, so that one owner cannot fill the database: each MiB of the quota allows ROWS_PER_MIB of
-them. Requests that arrive at the same moment may exceed this number slightly.
 
 A kept solution can be made again, so it takes no room from other things: the oldest solutions are removed if an upload,
 a result or another solution needs their room.
@@ -46,16 +42,12 @@ from workers.catalogue.tables import (
     Base,
     BulkItemRow,
     BulkRow,
-    DefaultContextRow,
     ImageRow,
     JobRow,
     OwnerRow,
     ProductRow,
-    PsfChangeRow,
-    PsfContextRow,
     PsfRow,
     ReportRow,
-    SeriesChangeRow,
     SolutionRow,
     TransitRow,
 )
@@ -64,18 +56,8 @@ from workers.contract.jobs import ENDED
 
 MIB = 2**20
 MOST_QUOTA_MIB = 2**31 - 1  # the largest number in the column of quotas
-ROWS_PER_MIB = 256
 FileRow = ImageRow | TransitRow | PsfRow | ProductRow | ReportRow | SolutionRow
 WITH_FILES: tuple[type[FileRow], ...] = (ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, SolutionRow)
-# The tables without files, and how many rows each of their rows stands for.
-WITHOUT_FILES: dict[type[Any], ColumnElement[int]] = {
-    JobRow: func.count(),
-    BulkRow: func.sum(BulkRow.total + 1),
-    PsfContextRow: func.sum(PsfContextRow.pins + 1),
-    PsfChangeRow: func.count(),
-    SeriesChangeRow: func.count(),
-    DefaultContextRow: func.count(),
-}
 # The kinds of things that the operator can keep for some time only (setting HELIOPSF_KEEP_DAYS).
 UPLOADED: dict[str, type[Any]] = {"image": ImageRow, "transit": TransitRow}
 KEPT: dict[str, type[Any]] = UPLOADED | {
@@ -84,9 +66,7 @@ KEPT: dict[str, type[Any]] = UPLOADED | {
     "job": JobRow,
     "bulk": BulkRow,
 }
-# Reasons for Usage.no_room and Usage.too_many_rows:
-NOT_KEPT = "the result of this job could not be kept"
-ROWS_NOT_KEPT = "what this request adds to the database could not be kept"
+NOT_KEPT = "the result of this job could not be kept"  # a reason for Usage.no_room
 
 BATCH = 1000  # rows that are read at once
 _DIGEST = re.compile(r"[0-9a-f]{64}")
@@ -98,13 +78,11 @@ _SKIPPED = frozenset({BulkItemRow.__tablename__})
 class Usage:
     """What an owner keeps, and the limit; limit_bytes None: no limit.
 
-    used_rows: the number of database rows without a file. removable_bytes: the part of used_bytes that kept solutions
-    take.
+    removable_bytes: the part of used_bytes that kept solutions take.
     """
 
     owner: str
     used_bytes: int
-    used_rows: int
     limit_bytes: int | None
     removable_bytes: int = 0
 
@@ -119,10 +97,6 @@ class Usage:
         """Whether no byte can be added without exceeding the limit."""
         return not self.allows(1)
 
-    def allows_rows(self, more_rows: int) -> bool:
-        """Whether ``more_rows`` more rows without a file may be added."""
-        return self.limit_bytes is None or self.used_rows + more_rows <= self._limit_rows
-
     def no_room(self, why: str) -> str:
         """The message for a full quota. why: a clause that says what could not be done."""
         assert self.limit_bytes is not None
@@ -132,22 +106,9 @@ class Usage:
             "quota"
         )
 
-    def too_many_rows(self, why: str) -> str:
-        """The message for too many rows. why: a clause that says what could not be done."""
-        return (
-            f"expected free room in your quota; it allows {self._limit_rows} database rows, {self.used_rows} are there (jobs, "
-            f"bulk runs with their images, contexts and changes of PSFs), and {why}: delete bulk runs and ended jobs that you "
-            "no longer need (`heliopsf bulk delete`), or ask the operator for a larger quota"
-        )
-
-    @property
-    def _limit_rows(self) -> int:
-        assert self.limit_bytes is not None
-        return self.limit_bytes // MIB * ROWS_PER_MIB
-
 
 class OverQuota(Exception):
-    """A file or rows do not fit into the owner's quota. usage: the owner's usage without them."""
+    """A file does not fit into the owner's quota. usage: the owner's usage without it."""
 
     def __init__(self, usage: Usage) -> None:
         super().__init__(usage.owner)
@@ -198,8 +159,8 @@ class Owners(Queries):
         owner: only the rows of this owner; empty: the rows of all owners except ``others``.
         """
         table = KEPT[kind]
-        without_file = table in WITHOUT_FILES
-        at, size = (table.ended_at, literal(0)) if without_file else (table.created_at, table.bytes)
+        has_file = table in WITH_FILES
+        at, size = (table.created_at, table.bytes) if has_file else (table.ended_at, literal(0))
         query = select(table.owner, table.id, size).where(at < before)
         query = query.where(table.owner == owner) if owner else query.where(table.owner.not_in(others))
         jobs = select(cast(JobRow.parameters, String)).where(JobRow.phase.not_in(ENDED))
@@ -329,14 +290,12 @@ def _limited(session: Session, owner: str, quota_mib: int) -> Usage | None:
 
 
 def _usage(session: Session, owner: str, limit_mib: int) -> Usage:
-    sums = {**{row: func.sum(row.bytes) for row in WITH_FILES}, **WITHOUT_FILES}
-    queries = (select(total).where(row.owner == owner).scalar_subquery() for row, total in sums.items())
-    row_of_sums = session.execute(select(*queries)).one()
-    totals = {table: int(total or 0) for table, total in zip(sums, row_of_sums, strict=True)}
+    sums = (select(func.sum(row.bytes)).where(row.owner == owner).scalar_subquery() for row in WITH_FILES)
+    row_of_sums = session.execute(select(*sums)).one()
+    totals = {table: int(total or 0) for table, total in zip(WITH_FILES, row_of_sums, strict=True)}
     return Usage(
         owner,
-        used_bytes=sum(totals[row] for row in WITH_FILES),
-        used_rows=sum(totals[row] for row in WITHOUT_FILES),
+        used_bytes=sum(totals.values()),
         limit_bytes=limit_mib * MIB if limit_mib else None,
         removable_bytes=totals[SolutionRow],
     )

@@ -54,22 +54,6 @@ class Turns:
         self._database.change(update(JobRow).where(*blocked, received).values(submitted_at=None))
         return None
 
-    def claim_short(
-        self, queue: Queue, worker: str, *, seconds: float, memory_mib: int, not_of: str | None = None
-    ) -> Lease | None:
-        """Claim a short job of a queue, to run it while a longer job pauses; None if there is no such job.
-
-        seconds, memory_mib: largest estimated time and memory of the job. not_of: an owner whose jobs are not
-        claimed. One message of the broker then remains; this message has no effect.
-        """
-        short = [
-            JobRow.owner != (not_of or ""),
-            JobRow.estimate["seconds"].as_float() <= seconds,
-            JobRow.estimate["memory_mib"].as_integer() <= memory_mib,
-        ]
-        job_id = self._next("", queue, *short)
-        return None if job_id is None else self._jobs.claim(job_id, worker)
-
     def leave_next(self, told_id: str, queue: Queue) -> str | None:
         """Record that a worker took a message from the broker but starts no job. The job will be submitted again.
 
@@ -80,11 +64,11 @@ class Turns:
             self._jobs.forget_submission(job_id)
         return job_id
 
-    def _next(self, told_id: str, queue: Queue, *conditions: ColumnElement[bool]) -> str | None:
-        """The id of the next job of a queue that meets the conditions; None if none of them can start now."""
+    def _next(self, told_id: str, queue: Queue) -> str | None:
+        """The id of the next job of a queue; None if no job of the queue can start now."""
         with self._database.reading() as session:
-            for owner in session.scalars(_owners(queue).where(*conditions)).all():
-                job_id = session.scalars(_oldest(owner, told_id, queue).where(*conditions)).first()
+            for owner in session.scalars(_owners(queue)).all():
+                job_id = session.scalars(_oldest(owner, told_id, queue)).first()
                 if job_id is not None:
                     return job_id
         return None

@@ -21,10 +21,8 @@ from workers.stage_timer import StageTimer
 
 log = logging.getLogger(__name__)
 
-Progress = Callable[[str, int, int], None]
 REPORT_EVERY_S = 0.3
 COMPILING = "compiling kernels (only once)"  # a stage of any job, in the first jobs of an installation
-LOOK_EVERY_S = 0.1
 
 
 class TookTooLong(Exception):
@@ -51,24 +49,17 @@ class Attempt:
 
     child: this process; None if it must not be ended. The process is ended if the job must stop but still runs
     ``cancel_s`` later, or if the thread of the heartbeats cannot run for ``silent_s``.
-    run_short(seconds): while this job pauses, runs one waiting job whose estimated time is at most ``seconds`` in this
-    process; returns False if no such job waits. A job pauses only in its main thread, and only for a job that is
-    expected to take no longer than this job has worked since its last pause.
     """
 
     catalogue: Catalogue
     lease: Lease
     heartbeat_s: float
     stopping: Stopping
-    also_report: Progress | None
     limit_s: float
     child: Child | None = None
     cancel_s: float = math.inf
     silent_s: float = math.inf
-    run_short: Callable[[float], bool] | None = None
     started: float = field(default_factory=time.monotonic)
-    resumed: float = field(default_factory=time.monotonic)
-    paused: threading.Event = field(default_factory=threading.Event)
     stopped: threading.Event = field(default_factory=threading.Event)
     ended: threading.Event = field(default_factory=threading.Event)
     last_report: float = 0.0
@@ -116,24 +107,15 @@ class Attempt:
                 self.stopped.set()
                 self._end_if_deaf()
                 return
-            late = time.monotonic() - self.started > self.limit_s + self.cancel_s
-            if late and not self.paused.is_set():
+            if time.monotonic() - self.started > self.limit_s + self.cancel_s:
                 self._give_up(
                     lambda: self.catalogue.jobs.fail(self.lease, TookTooLong(self.limit_s).as_error())
                 )
 
     def _end_if_deaf(self) -> None:
-        """Wait until the task has stopped. If it does not stop within ``cancel_s``, end the process.
-
-        A paused task cannot notice that it must stop, so ``cancel_s`` begins when the task continues.
-        """
-        if self.child is None:
-            return
-        since = time.monotonic()
-        while self.paused.is_set() or time.monotonic() < max(since, self.resumed) + self.cancel_s:
-            if self.ended.wait(min(self.cancel_s, LOOK_EVERY_S)):
-                return
-        self._give_up(lambda: self.catalogue.jobs.abort(self.lease))
+        """Wait until the task has stopped. If it does not stop within ``cancel_s``, end the process."""
+        if self.child is not None and not self.ended.wait(self.cancel_s):
+            self._give_up(lambda: self.catalogue.jobs.abort(self.lease))
 
     def _give_up(self, record: Callable[[], bool]) -> None:
         """Record the outcome of a job whose task does not respond, and end the process."""
@@ -153,10 +135,7 @@ class Attempt:
             self._report(stage, step, steps)
 
     def compiling(self, done: bool) -> None:
-        """Report that the task begins to compile a kernel (``done`` False) or has compiled it. Raises as ``report``.
-
-        The report has 0 steps, so that no short job runs meanwhile: numba must not be called while it compiles.
-        """
+        """Report that the task begins to compile a kernel (``done`` False) or has compiled it. Raises as ``report``."""
         with self.times.step(COMPILING, int(done)):
             if not done:
                 self._report(COMPILING, 0, 0)
@@ -171,35 +150,10 @@ class Attempt:
             except SQLAlchemyError as error:
                 # The database may answer again soon, so the task continues: its work must not be lost.
                 log.warning("job %s: could not write the progress: %s", self.lease.job_id, error)
-            if step < steps:
-                self._let_short_jobs_run()
         if self.stopped.is_set():
             raise Cancelled(self.lease.job_id)
         if time.monotonic() - self.started > self.limit_s:
             raise TookTooLong(self.limit_s)
-        if self.also_report is not None:
-            self.also_report(stage, step, max(steps, 1))
-
-    def _let_short_jobs_run(self) -> None:
-        """Run waiting jobs that need no longer than this job has worked since its last pause.
-
-        Therefore a short job waits for a long job at most about as long as the short job itself takes. Short jobs at
-        most double the time that the long job takes.
-        """
-        if self.run_short is None or threading.current_thread() is not threading.main_thread():
-            return
-        paused_at = time.monotonic()
-        self.paused.set()
-        try:
-            ran = self.run_short(paused_at - self.resumed)
-        finally:
-            now = time.monotonic()
-            self.started += now - paused_at
-            self.paused.clear()
-        if ran:
-            self.resumed = now
-            if self.child is not None:
-                self.child.expect_news_within(self.silent_s)
 
 
 @dataclass

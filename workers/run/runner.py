@@ -25,7 +25,7 @@ from workers.catalogue.tables import JobRow, ProductRow, PsfRow, ReportRow
 from workers.contract.jobs import Fault, JobError, Phase, Queue
 from workers.contract.kinds import KINDS
 from workers.files.store import NO_ROOM, STORAGE_FULL, Store, is_disk_full
-from workers.run.attempt import Assistance, Attempt, Cancelled, Progress, TookTooLong
+from workers.run.attempt import Assistance, Attempt, Cancelled, TookTooLong
 from workers.run.child import MARGIN, Child, Stopping, allowed_mib, is_out_of_memory
 from workers.settings import Settings
 from workers.stage_timer import StageTimer
@@ -78,19 +78,6 @@ class Runner:
         self._call_for_help, self._submit = call_for_help, submit
         self._stopping = stopping or Stopping()
         self._child = child
-        self._pausing = False  # a job pauses while this process runs a short one
-
-    def run(self, job_id: str, on_progress: Progress | None = None) -> None:
-        """Run the job if it is queued. Otherwise do nothing: the message was delivered twice, or the job was cancelled or claimed."""
-        if self._stopping.asked:
-            self._catalogue.jobs.forget_submission(job_id)
-            log.info("job %s: left in the queue because this worker is stopping", job_id)
-            return
-        lease = self._catalogue.jobs.claim(job_id, worker=worker_name())
-        if lease is None:
-            log.info("job %s: nothing to do: it is not queued, or an identical job is running", job_id)
-            return
-        self._run(lease, on_progress)
 
     def run_next(self, told_id: str, queue: Queue) -> None:
         """Run the next job of a queue: a job of the owner whose turn it is. The message of the broker names the job
@@ -105,7 +92,7 @@ class Runner:
             return
         self._run(lease)
 
-    def _run(self, lease: Lease, on_progress: Progress | None = None) -> None:
+    def _run(self, lease: Lease) -> None:
         # numba is imported only when a job runs, so that a process with a runner starts fast.
         from psfcore.compiled import listening
 
@@ -121,57 +108,16 @@ class Runner:
                 lease,
                 settings.heartbeat_s,
                 self._stopping,
-                on_progress,
                 settings.max_job_s,
                 child=self._child,
                 cancel_s=settings.cancel_s,
                 silent_s=settings.silent_s,
-                run_short=self._short_jobs_beside(job),
             )
             try:
                 with attempt.beating(), listening(attempt.compiling):
                     self._attempt(job, lease, attempt)
             finally:
                 self._keep_times(job, attempt.times)
-
-    def _short_jobs_beside(self, job: JobRow) -> Callable[[float], bool] | None:
-        """A function that runs one short interactive job in this process; None if this job must not pause.
-
-        While an interactive job pauses, only other owners' jobs run: its owner's jobs wait for their turn. A short job
-        does not pause itself. A job in its second or a later attempt does not pause either: a short job that ran during
-        its pause may have caused the earlier attempt to fail.
-        """
-        if (
-            self._child is None
-            or self._pausing
-            or job.attempt > 1
-            or Queue.INTERACTIVE not in self._settings.queues
-        ):
-            return None
-        not_of = job.owner if job.queue == Queue.INTERACTIVE else None
-        free_mib = self._settings.max_job_memory_mib - self._estimate_mib(job)
-
-        def run_short(seconds: float) -> bool:
-            if self._stopping.asked:
-                return False
-            try:
-                lease = self._catalogue.turns.claim_short(
-                    Queue.INTERACTIVE, worker_name(), seconds=seconds, memory_mib=free_mib, not_of=not_of
-                )
-            except SQLAlchemyError as error:
-                log.warning("job %s: could not look for short jobs: %s", job.id, error)
-                return False
-            if lease is None:
-                return False
-            log.info("job %s: pauses for the short job %s", job.id, lease.job_id)
-            self._pausing = True
-            try:
-                self._run(lease)
-            finally:
-                self._pausing = False
-            return True
-
-        return run_short
 
     def assist(self, job_id: str) -> None:
         """Compute parts of a job that another worker runs, until no part is left or the job ends."""

@@ -25,6 +25,7 @@ from service.cli.main import main
 from service.client.http import Client, ServiceError
 from tests.conftest import SMALL_INSTRUMENT
 from tests.service.conftest import refusal, result_of, settings_in, upload
+from tests.workers.jobs import run_job
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow, PsfRow
 from workers.run.runner import Runner
 
@@ -48,7 +49,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
 
         def run_jobs() -> None:
             for row in state.catalogue.page(JobRow, owner=DEFAULT_OWNER, limit=9):
-                Runner(settings, state.catalogue, state.store).run(row.id)
+                run_job(Runner(settings, state.catalogue, state.store), state.catalogue, row.id)
 
         psf = result_of(api, run_jobs, "psf-build", instrument_file=SMALL_INSTRUMENT, size=128)
         row = state.catalogue.get(PsfRow, psf["id"], DEFAULT_OWNER)

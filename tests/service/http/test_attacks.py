@@ -19,6 +19,7 @@ from tests.fits_bombs import lying_tiles
 from tests.service.conftest import refusal, settings_in, upload
 from tests.service.http.attacks import ARCHIVES, FILES, MIB, REQUESTS, Attack
 from tests.service.keyed import Keyed, keyed
+from tests.workers.jobs import run_job
 from workers.contract.jobs import Phase
 from workers.files.store import Store
 from workers.run.runner import Runner, load_tasks
@@ -130,7 +131,7 @@ def test_tiles_that_lie_pass_the_header_and_end_the_job_within_bounds(
     runner = Runner(settings, service.catalogue, Store(data))
     load_tasks()  # as a worker does; without other tests before this one, their libraries would be counted below
     with measured() as memory:
-        runner.run(job["id"])
+        run_job(runner, service.catalogue, job["id"])
     assert memory.mib < 64
     ended = ann.get(f"/v1/jobs/{job['id']}").json()
     assert ended["phase"] == Phase.ERROR

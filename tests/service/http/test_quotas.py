@@ -1,4 +1,4 @@
-"""What an owner may keep: refused before it is sent or worked on, with the figures of the owner's files and rows."""
+"""What an owner may keep: refused before it is sent or worked on, with the figures of the owner's files."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from fastapi.testclient import TestClient
 from service.cli.main import main
 from tests.conftest import write_image
 from tests.service.conftest import refusal, upload
+from tests.workers.jobs import run_job
 from workers.bulk.runs import keep_turns
-from workers.catalogue import owners
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ImageRow
 from workers.files.store import Store
@@ -55,7 +55,7 @@ def work(catalogue: Catalogue, settings: Settings) -> None:
     runner = Runner(settings, catalogue, Store(settings.data_dir))
     keep_turns(catalogue, settings)
     for turn in catalogue.jobs.of_kind("bulk"):
-        runner.run(turn.id)
+        run_job(runner, catalogue, turn.id)
 
 
 def test_an_upload_over_the_quota_is_refused_with_figures(
@@ -77,76 +77,6 @@ def test_an_upload_over_the_quota_is_refused_with_figures(
     assert list((tmp_path / "data" / "tmp").iterdir()) == []
     assert len(api.get("/v1/images").json()["items"]) == 1
     upload(api, large(tmp_path / "small.fits", 300))
-
-
-def test_rows_over_their_number_are_refused_and_add_nothing(
-    api: TestClient,
-    catalogue: Catalogue,
-    image_file: Path,
-    psf_file: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    image_id, psf_id = upload(api, image_file), upload(api, psf_file, "/v1/psfs")
-    series = {"instrument": "i", "channel": "1", "kind": "total"}
-    body = {"status": "certified", "reason": "r", "version": "1.0.0", **series}
-    assert api.post(f"/v1/psfs/{psf_id}/status", json=body).status_code == 200
-    form = {"KIND": "psf-build"}
-    drafts = [
-        api.post("/uws/jobs", data=form, follow_redirects=False).headers["Location"][-32:] for _ in range(2)
-    ]
-    requests: list[tuple[str, str, dict[str, Any]]] = [
-        ("POST", "/v1/jobs", {"kind": "deconvolve", "parameters": {"image_id": image_id, "psf_id": psf_id}}),
-        ("POST", "/v1/bulk", {"images": [image_id], "psf_id": psf_id}),
-        ("POST", "/v1/contexts", {"name": "c"}),
-        ("PUT", "/v1/contexts/default", {"context": None}),
-        ("POST", f"/v1/psfs/{psf_id}/status", {"status": "certified", "reason": "again"}),
-    ]
-    there = catalogue.owners.usage("local", 1).used_rows
-    monkeypatch.setattr(owners, "ROWS_PER_MIB", there)
-    for method, where, body in requests:
-        answer = api.request(method, where, json=body)
-        detail = refusal(answer, 507, "quota-exceeded")
-        assert f"it allows {there} database rows, {there} are there" in detail, where
-        assert (answer.json()["used_bytes"], answer.json()["limit_bytes"]) == (counted(catalogue), 2**20)
-    build = {"KIND": "psf-build", "instrument": "hri_euv"}
-    for form in (build, build | {"PHASE": "RUN"}):
-        answer = api.post("/uws/jobs", data=form)
-        assert answer.status_code == 507 and "expected free room in your quota" in answer.text, form
-    assert catalogue.owners.usage("local", 1).used_rows == there
-    for draft in drafts:
-        assert api.delete(f"/uws/jobs/{draft}", follow_redirects=False).status_code == 303
-    assert api.post(requests[0][1], json=requests[0][2]).status_code == 202, "deleted jobs make room"
-    wrong = {"status": "deprecated", "reason": "wrong"}
-    monkeypatch.setattr(owners, "ROWS_PER_MIB", 0)
-    assert api.post(f"/v1/psfs/{psf_id}/status", json=wrong).status_code == 200, "whatever the quota"
-
-
-def test_a_listing_that_fills_the_quota_stops_and_goes_on_with_room(
-    api: TestClient,
-    catalogue: Catalogue,
-    tmp_path: Path,
-    settings: Settings,
-    psf_file: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("workers.bulk.listing.LIST_AT_ONCE", 4)
-    (tmp_path / "archive").mkdir()
-    for number in range(12):
-        (tmp_path / "archive" / f"{number}.fits").touch()
-    request = {"files": [{"glob": f"{tmp_path}/archive/*"}], "psf_id": upload(api, psf_file, "/v1/psfs")}
-    here = f"/v1/bulk/{api.post('/v1/bulk', json=request).json()['id']}"
-    keep_turns(catalogue, settings)
-    there = catalogue.owners.usage("local", 1).used_rows
-    monkeypatch.setattr(owners, "ROWS_PER_MIB", there + 6)
-    work(catalogue, settings)
-    stopped = api.get(here).json()
-    assert (stopped["phase"], stopped["error"]["code"]) == ("ERROR", "quota-exceeded")
-    assert "not all files that the patterns match could be listed" in stopped["error"]["message"]
-    assert stopped["images"]["total"] == 4
-    catalogue.owners.set_quota("local", 2)
-    assert api.post(f"{here}/resume").status_code == 200
-    work(catalogue, settings)
-    assert api.get(here).json()["images"]["total"] == 12
 
 
 def test_jobs_that_were_queued_while_there_was_room_end_where_there_is_none(
@@ -172,7 +102,7 @@ def test_jobs_that_were_queued_while_there_was_room_end_where_there_is_none(
     runner = Runner(settings, catalogue, Store(settings.data_dir))
     jobs = {}
     for job_id in (first, second, equal, tables):
-        runner.run(job_id)
+        run_job(runner, catalogue, job_id)
         jobs[job_id] = api.get(f"/v1/jobs/{job_id}").json()
     error = jobs[second]["error"]
     assert (jobs[second]["phase"], error["code"], error["fault"]) == ("ERROR", "quota-exceeded", "user")

@@ -17,6 +17,7 @@ from service.pages import assets
 from service.pages.rendering import templates
 from tests.conftest import write_image
 from tests.service.conftest import upload, work_through_bulks
+from tests.workers.jobs import run_job
 from workers.catalogue.catalogue import Catalogue
 from workers.files.store import Store
 from workers.run.runner import Runner
@@ -117,7 +118,7 @@ def filled(api: TestClient, settings: Settings, psf_file: Path, tmp_path: Path) 
     catalogue = Catalogue(settings.catalogue_url)
     runner = Runner(settings, catalogue, Store(settings.data_dir))
     for row in catalogue.jobs.of_kind("deconvolve"):
-        runner.run(row.id)
+        run_job(runner, catalogue, row.id)
     api.post("/v1/bulk", json={"images": ids, "psf_id": psf_id, "parameters": FEW})
     work_through_bulks(settings)
     for steps in range(3, 60):

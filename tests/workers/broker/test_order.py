@@ -269,7 +269,6 @@ def test_what_others_write_into_the_broker_stops_no_worker(broker: Broker, tmp_p
     catalogue = Catalogue(broker.settings.catalogue_url)
     catalogue.upgrade()
     app, log = queue.make_app(broker.settings), tmp_path / "worker.log"
-    worker = started_worker(WORKER, broker.settings, log)
 
     def submitted() -> str:
         job, _ = catalogue.jobs.submit("psf-build", {}, uuid.uuid4().hex, DEFAULT_OWNER)
@@ -282,7 +281,7 @@ def test_what_others_write_into_the_broker_stops_no_worker(broker: Broker, tmp_p
         return not broker.left() and all(job_row(catalogue, job).phase == Phase.COMPLETED for job in jobs)
 
     jobs = [submitted()]
-    try:
+    with started_worker(WORKER, broker.settings, log) as worker:
         wait_for(done, "the worker is there")
         app.control.rate_limit(queue.RUN_JOB, "1/h")
         app.control.cancel_consumer(broker_name(Queue.INTERACTIVE))
@@ -294,9 +293,5 @@ def test_what_others_write_into_the_broker_stops_no_worker(broker: Broker, tmp_p
         wait_for(done, "the jobs are done, and nothing is put back")
         worker.send_signal(signal.SIGTERM)
         assert worker.wait(60.0) == 0
-    finally:
-        if worker.poll() is None:
-            worker.kill()
-            worker.wait()
-        catalogue.close()
+    catalogue.close()
     assert log.read_text().count("that this service did not send") > 40

@@ -21,7 +21,7 @@ from tests.conftest import write_image
 from tests.s3 import s3_bucket, shared_server
 from tests.service.conftest import upload
 from tests.workers.databases import rows
-from tests.workers.jobs import claimed
+from tests.workers.jobs import claimed, run_job
 from workers.bulk import image as bulk_image
 from workers.bulk import listing, task
 from workers.bulk.listing import Place
@@ -87,7 +87,7 @@ class Run:
     def turn(self) -> None:
         keep_turns(self.catalogue, self.settings)
         for job in self.catalogue.jobs.of_kind("bulk"):
-            Runner(self.settings, self.catalogue, self.store).run(job.id)
+            run_job(Runner(self.settings, self.catalogue, self.store), self.catalogue, job.id)
 
     def turns(self) -> int:
         """Run turns until the run stops; returns their number."""
@@ -275,7 +275,7 @@ def test_other_turns_process_images_while_one_lists(run: Run, monkeypatch: pytes
     keep_turns(run.catalogue, run.settings)
     others = [job for job in run.catalogue.jobs.of_kind("bulk") if job.id != lease.job_id]
     assert len(others) == IN_FOLDER - 1
-    Runner(run.settings, run.catalogue, run.store).run(others[0].id)
+    run_job(Runner(run.settings, run.catalogue, run.store), run.catalogue, others[0].id)
     now = run.now()
     assert (now["phase"], now["images"]["done"], now["images"]["waiting"]) == ("LISTING", IN_FOLDER, 0)
 

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from functools import partial
 
 import pytest
 
 from tests.workers.databases import BOTH
-from tests.workers.jobs import bulk_row, claimed, job_row
+from tests.workers.jobs import claimed, job_row
 from tests.workers.psf_examples import OWNER, certify, identity, product, psf, refused
-from workers.catalogue.bulks import Listed, new_id
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.contexts import Pin
-from workers.catalogue.owners import MIB, ROWS_PER_MIB, OverQuota
+from workers.catalogue.owners import MIB, OverQuota
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, SolutionRow
 
 
@@ -103,55 +99,6 @@ def test_the_files_of_each_kind_count_and_nobody_else_s(catalogue: Catalogue) ->
     assert usage.used_bytes == sum(row.bytes for row in rows) and usage.removable_bytes == 11
     assert [one.owner for one in catalogue.owners.all(1)] == sorted([OWNER, "somebody"])
     assert catalogue.owners.limited(OWNER, 1) == usage and catalogue.owners.limited(OWNER, 0) is None
-
-
-# Rows without files -----------------------------------------------------------------------------------
-
-
-@contextmanager
-def counting(catalogue: Catalogue, expected: int) -> Iterator[None]:
-    """Check that the block changes the number of rows of the owner by so much."""
-    before = catalogue.owners.usage(OWNER, 0).used_rows
-    yield
-    assert catalogue.owners.usage(OWNER, 0).used_rows - before == expected
-
-
-def test_jobs_bulk_runs_contexts_and_changes_count_until_they_are_deleted(catalogue: Catalogue) -> None:
-    with counting(catalogue, 1):
-        turn, _ = catalogue.jobs.submit("bulk", {}, new_id(), OWNER)
-        lease = claimed(catalogue, turn.id)
-    row = bulk_row(OWNER, listed=False)
-    with counting(catalogue, 1 + 3):
-        assert catalogue.bulks.create(row, [f"{number:064x}" for number in range(3)])[1]
-    with counting(catalogue, 1):
-        assert catalogue.bulks.begin_listing(row.id, lease)
-        assert catalogue.bulks.add_listed(
-            row.id, lease, [Listed("/a", False)], {"pattern": 0, "names": ["a"]}
-        )
-    for name in ("a", "b"):
-        catalogue.add(psf(name))
-    with counting(catalogue, 1):
-        certify(catalogue, "a", "1.0.0")
-    with counting(catalogue, 2):  # of both PSFs
-        certify(catalogue, "b", "2.0.0", supersedes=(identity("a"),))
-    for new, expected in ((True, 2), (False, 0)):
-        with counting(catalogue, expected):
-            assert catalogue.contexts.create("first", OWNER, "x", pins=[Pin(identity("b"))])[1] == new
-    with counting(catalogue, 1):
-        catalogue.contexts.set_default("first", OWNER, "x")
-    for expected in (1, 0):  # the second changes nothing
-        with counting(catalogue, expected):
-            catalogue.series.set_interpolated("hri_euv/174/total", OWNER, True, "x")
-    with counting(catalogue, -1 - 5):
-        catalogue.uws.destroy(turn.id)
-        assert catalogue.bulks.cancel(row.id) and catalogue.bulks.delete(row.id)
-
-
-def test_a_quota_allows_so_many_rows_for_each_mib(catalogue: Catalogue) -> None:
-    catalogue.jobs.submit("psf-build", {}, "k", OWNER)
-    usage = catalogue.owners.usage(OWNER, 2)
-    assert usage.allows_rows(2 * ROWS_PER_MIB - 1) and not usage.allows_rows(2 * ROWS_PER_MIB)
-    assert catalogue.owners.usage(OWNER, 0).allows_rows(10**9)
 
 
 # Deletions ------------------------------------------------------------------------------------------

@@ -319,6 +319,7 @@ def test_a_collection_beside_a_running_service_loses_no_file(
 def test_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     settings = Settings(data_dir=tmp_path / "data")
     monkeypatch.setenv("HELIOPSF_DATA_DIR", str(settings.data_dir))
+    monkeypatch.setattr(collection, "time", SimpleNamespace(time=time.time, sleep=lambda _: None))
     store, catalogue = Store(settings.data_dir), Catalogue(settings.catalogue_url)
     catalogue.upgrade()
     catalogue.add(image(kept(store, b"a")))

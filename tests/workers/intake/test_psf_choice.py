@@ -325,9 +325,3 @@ def test_what_does_not_agree_is_told_too(local: InProcess, tmp_path: Path) -> No
         assert told in of_file
     (of_psf,) = (psf["told"] for psf in error.fields["psfs"])
     assert of_psf == "same telescope, but another pixel scale (0.6, not 2.4 arcsec)"
-
-
-def test_an_image_without_any_name_gets_the_ways_too(local: InProcess, tmp_path: Path) -> None:
-    error = refused_image(local, tmp_path, TELESCOP="")
-    assert error.fields["psfs"] == [] and len(error.fields["ways"]) == 3
-    assert "an unnamed instrument" in error.message

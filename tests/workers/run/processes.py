@@ -5,10 +5,13 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from workers.settings import Settings
 
+STOPS_WITHIN_S = 30.0
 _LIGHT = """
 import contextlib, sys, time, types
 sys.modules["psfcore.compiled"] = types.SimpleNamespace(listening=lambda report: contextlib.nullcontext())
@@ -29,12 +32,13 @@ def worker_of(task: str, options: str = "") -> str:
     return _LIGHT.format(task=task, options=options)
 
 
+@contextmanager
 def started_worker(
     code: str, settings: Settings, log: Path, **changes: float | str
-) -> subprocess.Popen[bytes]:
+) -> Iterator[subprocess.Popen[bytes]]:
     """A process that runs this code with the data folder and the broker of the settings; its lines go into a file.
 
-    changes: further settings by name. The caller ends the process.
+    changes: further settings by name. If the process still runs at the end of the block, it is stopped.
     """
     environment = {name: value for name, value in os.environ.items() if not name.startswith("HELIOPSF_")} | {
         "HELIOPSF_DATA_DIR": str(settings.data_dir),
@@ -43,7 +47,16 @@ def started_worker(
         "OMP_NUM_THREADS": "1",
     }
     environment |= {f"HELIOPSF_{name.upper()}": str(value) for name, value in changes.items()}
-    with log.open("wb") as written:
-        return subprocess.Popen(
-            [sys.executable, "-c", code], env=environment, stdout=subprocess.DEVNULL, stderr=written
-        )
+    command = [sys.executable, "-c", code]
+    with (
+        log.open("wb") as written,
+        subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=written) as process,
+    ):
+        try:
+            yield process
+        finally:
+            process.terminate()
+            try:
+                process.wait(STOPS_WITHIN_S)
+            except subprocess.TimeoutExpired:
+                process.kill()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -31,7 +30,7 @@ import ctypes
 import numpy as np
 
 def task(context, parameters):
-    context.report("at work", 2, 2)  # the last step: the process runs no short job between this report and the work
+    context.report("at work", 1, 2)
     match parameters["what"]:
         case "greedy":
             kept = []
@@ -98,17 +97,9 @@ def worker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Worker]:
     catalogue.upgrade()
     log = folder / "worker.log"
     times = {"stop_s": 0.1, "heartbeat_s": 0.1, "lease_s": LEASE_S, "cancel_s": 0.3}
-    process = started_worker(WORKER, settings, log, worker_threads=2, **times)
-    try:
+    with started_worker(WORKER, settings, log, worker_threads=2, **times) as process:
         yield Worker(process, catalogue, queue.make_app(settings), log)
-    finally:
-        process.send_signal(signal.SIGTERM)
-        try:
-            process.wait(30)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-        catalogue.close()
+    catalogue.close()
 
 
 def test_a_greedy_job_fails_at_its_limit_and_the_next_one_runs(worker: Worker) -> None:

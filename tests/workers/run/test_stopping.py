@@ -66,15 +66,6 @@ def test_a_job_that_ends_in_time_is_let_end_and_asking_again_does_not_move_the_m
     assert stopping.asked and stopping.due
 
 
-def test_a_worker_that_stops_takes_no_job(bench: Bench) -> None:
-    bench.stopping.ask(30.0)
-    row = bench.run(steps_for(0.0))
-    assert (row.phase, row.attempt) == (Phase.QUEUED, 0)
-    assert [job_id for job_id, _ in bench.catalogue.jobs.unsubmitted(3600.0)] == [row.id], (
-        "the message is gone"
-    )
-
-
 def test_a_cancelled_job_is_not_handed_back(bench: Bench) -> None:
     def cancelled(context: Context, _: Mapping[str, Any]) -> str:
         bench.catalogue.jobs.cancel(context.job_id)
@@ -83,6 +74,13 @@ def test_a_cancelled_job_is_not_handed_back(bench: Bench) -> None:
 
     row = bench.run(cancelled)
     assert (row.phase, row.result_id) == (Phase.ABORTED, None)
+
+
+def test_a_job_that_takes_too_long_ends_at_its_next_report(bench: Bench) -> None:
+    row = bench.run(steps_for(60.0), max_job_s=0.05)
+    assert row.phase == Phase.ERROR and row.error is not None
+    assert (row.error["code"], row.error["fault"]) == ("took-too-long", "user")
+    assert "0.05 s (HELIOPSF_MAX_JOB_S)" in row.error["message"]
 
 
 # Heartbeats -----------------------------------------------------------------------------------------
@@ -101,7 +99,7 @@ def test_a_heartbeat_that_failed_is_followed_by_another() -> None:
         return True
 
     catalogue = SimpleNamespace(jobs=SimpleNamespace(heartbeat=heartbeat))
-    attempt = Attempt(catalogue, Lease("job", "token"), 0.01, Stopping(), None, limit_s=60.0)  # type: ignore[arg-type]
+    attempt = Attempt(catalogue, Lease("job", "token"), 0.01, Stopping(), limit_s=60.0)  # type: ignore[arg-type]
     with attempt.beating():
         assert third.wait(10.0), beats
     assert not attempt.stopped.is_set()
@@ -111,7 +109,7 @@ def test_a_heartbeat_that_failed_is_followed_by_another() -> None:
 
 DEAF = worker_of("""
 def task(context, _):
-    context.report("at work", 2, 2)
+    context.report("at work", 1, 2)
     time.sleep(60)
 """)
 
@@ -124,18 +122,13 @@ def test_a_worker_that_stops_hands_back_the_job_of_a_deaf_task_and_is_gone(tmp_p
     job, _ = catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)
     assert queue.submit(queue.make_app(settings), job.id)
     log = tmp_path / "worker.log"
-    worker = started_worker(DEAF, settings, log, stop_s=0.5, heartbeat_s=0.2, lease_s=3)
-    try:
+    with started_worker(DEAF, settings, log, stop_s=0.5, heartbeat_s=0.2, lease_s=3) as worker:
         wait_for(lambda: job_row(catalogue, job.id).phase == "EXECUTING", "the job is at work")
         wait_for(lambda: len(catalogue.census.workers(3.0)) == 1, "the worker says that it is there")
         processes = [psutil.Process(worker.pid), *psutil.Process(worker.pid).children(recursive=True)]
         worker.send_signal(signal.SIGTERM)
         status = worker.wait(settings.gone_s + 15.0)  # the machine may be busy
         _, left = psutil.wait_procs(processes, timeout=5)
-    finally:
-        if worker.poll() is None:
-            worker.kill()
-            worker.wait()
     assert status == 0 and left == [], f"{status}, {left}; {log.read_text()}"
     row = job_row(catalogue, job.id)
     assert (row.phase, row.attempt, row.submitted_at) == (Phase.QUEUED, 0, None)
@@ -153,13 +146,8 @@ def test_a_worker_that_ends_by_an_error_has_no_status_of_success(settings: Setti
     settings.data_dir.mkdir()
     catalogue = Catalogue(settings.catalogue_url)
     catalogue.upgrade()
-    worker = started_worker(worker_of("task = None"), settings, tmp_path / "worker.log")
-    try:
+    with started_worker(worker_of("task = None"), settings, tmp_path / "worker.log") as worker:
         wait_for(lambda: len(catalogue.census.workers(60.0)) == 1, "the worker is there")
         shutil.rmtree(settings.data_dir / "broker" / "queue")
         assert worker.wait(60.0) == 1
-    finally:
-        if worker.poll() is None:
-            worker.kill()
-            worker.wait()
-        catalogue.close()
+    catalogue.close()

@@ -13,7 +13,7 @@ from sqlalchemy import update
 from tests.in_process import InProcess
 from tests.transit_files import write_transit
 from tests.workers.databases import change
-from tests.workers.jobs import job_row
+from tests.workers.jobs import job_row, run_job
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Part, Parts
 from workers.catalogue.tables import JobRow, PartRow
@@ -69,14 +69,14 @@ def test_a_killed_worker_loses_no_fold_and_no_fold_counts_twice(
     monkeypatch.setattr(Parts, "release", lambda self, part: None)
     runner = Runner(local.settings, local.catalogue, local.store)
     with pytest.raises(Killed):
-        runner.run(job_id)
+        run_job(runner, local.catalogue, job_id)
     long_s = 2 * local.settings.lease_s
     for table in (JobRow, PartRow):
         change(local.catalogue, update(table).values(heartbeat_at=table.heartbeat_at - long_s))
     assert local.catalogue.jobs.give_up_silent(local.settings.lease_s, local.settings.max_attempts) == [
         job_id
     ]
-    runner.run(job_id)
+    run_job(runner, local.catalogue, job_id)
     row = job_row(local.catalogue, job_id)
     assert (row.phase, row.attempt) == (Phase.COMPLETED, 2)
     assert sorted(fold for fold in done if fold != (-1, -1)) == ALL, "each once"
@@ -108,7 +108,8 @@ def test_another_worker_shares_the_folds(
         helpers.append(threading.Thread(target=help_out, name="helper"))
         helpers[-1].start()
 
-    Runner(local.settings, local.catalogue, local.store, call_for_help).run(job_id)
+    runner = Runner(local.settings, local.catalogue, local.store, call_for_help)
+    run_job(runner, local.catalogue, job_id)
     helpers[0].join()
     row = job_row(local.catalogue, job_id)
     assert row.phase == Phase.COMPLETED

@@ -19,7 +19,7 @@ from psfcore.drawing import plots
 from service.client.http import ServiceError
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
 from tests.in_process import InProcess
-from tests.workers.jobs import job_row
+from tests.workers.jobs import job_row, run_job
 from workers.contract.jobs import Phase
 from workers.contract.requests import METHODS
 from workers.run.runner import Runner
@@ -146,12 +146,12 @@ def test_a_transient_failure_is_retried_a_limited_number_of_times(
     phases = []
     runner = Runner(settings, local.catalogue, local.store)
     for _ in range(settings.max_attempts):
-        runner.run(job["id"])
+        run_job(runner, local.catalogue, job["id"])
         row = job_row(local.catalogue, job["id"])
         phases.append(row.phase)
     assert phases == [Phase.QUEUED] * (settings.max_attempts - 1) + [Phase.ERROR]
     assert row.error is not None and row.error["fault"] == "transient"
-    runner.run(job["id"])
+    run_job(runner, local.catalogue, job["id"])
     assert job_row(local.catalogue, job["id"]).attempt == row.attempt, (
         "a message that comes again does nothing"
     )

@@ -18,6 +18,7 @@ from psfcore.deconvolve import run
 from tests.conftest import write_image, write_psf
 from tests.service.api.bulk.conftest import FEW, failures, now, results, started
 from tests.service.conftest import upload
+from tests.workers.jobs import run_job
 from workers.bulk import image as bulk_image
 from workers.bulk.runs import keep_turns
 from workers.catalogue.catalogue import Catalogue
@@ -222,7 +223,7 @@ def test_a_run_waits_for_a_job_that_is_computing_the_image(
             return
         catalogue.jobs.requeue(lease)
         if job_ends:
-            Runner(settings, catalogue, Store(settings.data_dir)).run(job["id"])
+            run_job(Runner(settings, catalogue, Store(settings.data_dir)), catalogue, job["id"])
 
     monkeypatch.setattr(bulk_image, "_rest", rest)
     bulk = started(api, images=[image_id], psf_id=psf_id)
@@ -231,7 +232,7 @@ def test_a_run_waits_for_a_job_that_is_computing_the_image(
     assert len(rests) == 3 and len(computed) == 1 and line["reused"] == job_ends
     assert now(api, bulk)["images"]["done"] == 1
     if not job_ends:
-        Runner(settings, catalogue, Store(settings.data_dir)).run(job["id"])
+        run_job(Runner(settings, catalogue, Store(settings.data_dir)), catalogue, job["id"])
         assert len(computed) == 1
     assert api.get(f"/v1/jobs/{job['id']}").json()["result"] == f"/v1/products/{line['product_id']}"
 
@@ -341,7 +342,7 @@ def test_a_turn_lets_others_go_first_after_each_image(
     turns = 0
     for done in (1, 2):
         while now(api, bulk)["images"]["done"] < done:
-            runner.run(turn.id)
+            run_job(runner, catalogue, turn.id)
             turns += 1
             row = catalogue.jobs.get(turn.id)
             assert row is not None and (row.phase, row.attempt, row.lease) == ("QUEUED", 0, None)
@@ -349,7 +350,7 @@ def test_a_turn_lets_others_go_first_after_each_image(
         assert now(api, bulk)["images"]["done"] == done
     assert turns <= 3  # the first turn may end as soon as it has listed files
     catalogue.jobs.cancel(waiting.id)
-    runner.run(turn.id)
+    run_job(runner, catalogue, turn.id)
     assert now(api, bulk)["images"]["done"] == 3 and len(again) == turns
 
 

@@ -14,6 +14,7 @@ from service.app import create_app
 from tests.conftest import write_image
 from tests.service.api.bulk.conftest import FEW, failures, now, started
 from tests.service.conftest import refusal, result_of, upload, work_through_bulks
+from tests.workers.jobs import run_job
 from workers.bulk import dry_run
 from workers.bulk import task as bulk_task
 from workers.bulk.runs import keep_turns
@@ -164,7 +165,7 @@ def test_an_image_that_takes_too_long_fails_but_a_turn_may_last_longer(
         catalogue = Catalogue(limited.catalogue_url)
         keep_turns(catalogue, limited)
         (turn,) = catalogue.jobs.of_kind("bulk")
-        Runner(limited, catalogue, Store(limited.data_dir)).run(turn.id)
+        run_job(Runner(limited, catalogue, Store(limited.data_dir)), catalogue, turn.id)
         catalogue.close()
         ended = now(api, bulk)
         assert (ended["phase"], ended["images"]["done"], ended["images"]["failed"]) == ("COMPLETED", 3, 1)
