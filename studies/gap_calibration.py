@@ -126,11 +126,11 @@ def departures_of(refits: Refits) -> tuple[float, ...]:
     out = []
     for form, refit in refits.made.items():
         before = refits.model_with(form)
-        if refit.evidence.images != before.evidence.images:
+        if refit.model.evidence.images != before.evidence.images:
             continue
         linear = fit_effects(before, refit.effects, any_sign=True).step
         left = before.left(linear)
-        real = refit.model.left(refit.model.fit(refit.evidence.of_effects))
+        real = refit.model.left(refit.model.fit(refit.model.evidence.of_effects))
         base = len(before.evidence.base)
         own = list(linear.columns[base:])
         change = [disc.jacobian[own].T @ linear.values[base:] for disc in before.discs]

@@ -68,13 +68,13 @@ Row = dict[str, Any]
 Holds = Callable[[Judged], float | None]  # 1 if a case meets a condition, 0 if not; 0.5 counts as half a case
 
 
-def wilson(hits: float, cases: int, z: float = Z95) -> tuple[float, float]:
+def wilson(hits: float, cases: int) -> tuple[float, float]:
     """Eq. (1) for hits / cases; (0, 1) if there is no case."""
     if cases == 0:
         return 0.0, 1.0
-    p, spread = hits / cases, z**2 / cases
+    p, spread = hits / cases, Z95**2 / cases
     middle = (p + spread / 2) / (1 + spread)
-    half = z * math.sqrt(p * (1 - p) / cases + spread / (4 * cases)) / (1 + spread)
+    half = Z95 * math.sqrt(p * (1 - p) / cases + spread / (4 * cases)) / (1 + spread)
     return max(0.0, middle - half), min(1.0, middle + half)
 
 

@@ -20,7 +20,7 @@ from psfcore.drawing.plots import (
     write_png,
 )
 from psfcore.evaluation.evaluation import Evaluation, FrameEvaluation, Superposed
-from psfcore.evaluation.report import sentence
+from psfcore.evaluation.report import each, sentence
 from psfcore.scatter.shapes import Vector
 from psfcore.scatter.validation.robustness import DarkOffsetStudy
 
@@ -63,11 +63,6 @@ def evaluation_png(
         charts += offsets
     tidy(charts)
     write_png(figure, path)
-
-
-def each(frames: Sequence[FrameEvaluation], name: str) -> Vector:
-    """An attribute of every image."""
-    return np.array([getattr(frame, name) for frame in frames], dtype=np.float64)
 
 
 def pointings(frames: Sequence[FrameEvaluation]) -> list[int]:

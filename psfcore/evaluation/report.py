@@ -101,9 +101,9 @@ def summaries(evaluation: Evaluation) -> tuple[Summary, ...]:
 
 def summary_of(frames: Sequence[FrameEvaluation], fov: int | None) -> Summary:
     """Summary of the errors of these images."""
-    residual, noise = _each(frames, "residual_pct"), _each(frames, "noise_pct")
-    error = _each(frames, "error_dn_s")
-    centre, centre_noise = _each(frames, "centre_pct"), _each(frames, "centre_noise_pct")
+    residual, noise = each(frames, "residual_pct"), each(frames, "noise_pct")
+    error = each(frames, "error_dn_s")
+    centre, centre_noise = each(frames, "centre_pct"), each(frames, "centre_noise_pct")
     there = np.isfinite(centre)
     return Summary(
         fov=fov,
@@ -132,7 +132,7 @@ def trends(evaluation: Evaluation) -> tuple[Trend, ...]:
             if len(frames) < LEAST_TREND_FRAMES or np.ptp(where) < 1.0:
                 continue
             relative, absolute = (
-                slope_of(where, _each(frames, value), _each(frames, noise))
+                slope_of(where, each(frames, value), each(frames, noise))
                 for value, noise in (("residual_pct", "noise_pct"), ("error_dn_s", "noise_dn_s"))
             )
             found.append(Trend(fov, against, len(frames), relative, absolute))
@@ -150,7 +150,8 @@ def slope_of(where_px: Vector, error: Vector, noise: Vector) -> Slope:
     return Slope(TREND_PX * slope, TREND_PX * math.sqrt(excess / spread))  # Eq. (2)
 
 
-def _each(frames: Sequence[FrameEvaluation], name: str) -> Vector:
+def each(frames: Sequence[FrameEvaluation], name: str) -> Vector:
+    """An attribute of every image."""
     return np.array([getattr(frame, name) for frame in frames], dtype=np.float64)
 
 

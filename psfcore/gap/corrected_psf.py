@@ -24,7 +24,8 @@ from psfcore.errors import DataError
 from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.verdict.correction import Corrected
 from psfcore.gap.view import Field, View
-from psfcore.psf import REACH_GRID_PX, FittedShape, Psf, crop_or_pad
+from psfcore.psf import REACH_GRID_PX, Psf
+from psfcore.scatter.fit import psf_of_fit
 from psfcore.scatter.total_psf import Blur, Lanes, Optics, TotalPsf
 from psfcore.transit.transit import Place
 
@@ -45,7 +46,7 @@ def corrected_psf(found: Diagnosis, name: str, version: str, provenance: dict[st
             "expected a diagnosis that names an effect and fitted it together with the PSF; got the verdict "
             f"{found.judgement.verdict}: this diagnosis has no corrected PSF",
         )
-    transit, inversion = added.solution.transit, added.solution.inversion
+    inversion = added.solution.inversion
     history = {
         "effects": [effect.name for effect in added.effects],
         "effect_in_kernel": [effect.name for effect in added.effects if effect.stage == "optics"],
@@ -56,27 +57,11 @@ def corrected_psf(found: Diagnosis, name: str, version: str, provenance: dict[st
         "verdict": found.judgement.verdict,
         "gap_before_pct": found.rms.to_json(),
         "gap_after_pct": found.after.to_json(),
-        "inputs_sha256": transit.sha256,
+        "inputs_sha256": added.solution.transit.sha256,
     }
-    return Psf(
-        kernel=_kernel(added),
-        name=name,
-        version=version,
-        instrument=transit.instrument,
-        status="draft",
-        plate_scale_arcsec=transit.plate_scale_arcsec,
-        components={
-            "DIFFRACTION": crop_or_pad(transit.diffraction, REACH_GRID_PX),
-            "SCATTER": inversion.shape.kernel(inversion.coordinates, REACH_GRID_PX),
-        },
-        provenance=provenance | history,
-        fitted=FittedShape(
-            shape=inversion.shape.name,
-            parameters=inversion.shape.names,
-            coordinates=tuple(inversion.coordinates.tolist()),
-            covariance=tuple(tuple(row) for row in added.covariance.tolist()),
-        ),
-    )
+    scatter = inversion.shape.kernel(inversion.coordinates, REACH_GRID_PX)
+    named = {"name": name, "version": version, "provenance": provenance | history}
+    return psf_of_fit(_kernel(added), scatter, added.solution, added.covariance, **named)
 
 
 def _kernel(added: Corrected) -> Kernel:

@@ -187,7 +187,7 @@ def diagnose(
     before, gone = held_out[0], None if best is None else after[best]
     explained = fits[best] if best is not None and judged.answer else None
     named = judged.verdict in ("attributed", "tie") and gone is not None
-    rms = gap(before, rng) if before is not None else Interval(0.0, 0.0, 0.0)
+    rms = gap(before.residual_pct, before.noise_pct, rng) if before is not None else Interval(0.0, 0.0, 0.0)
     cautions = [*cautions_of(solution, noise, model.evidence), *refits.failures]
     if named and best is not None and gone is not None and rms.low > 0:  # the discs show the gap
         error_pct = float(np.sqrt(np.mean(gone.noise_pct**2)))
@@ -210,7 +210,7 @@ def diagnose(
         ),
         before_refit=_before_refit(explained, rng) if named and explained is not None else rms,
         rms=rms,
-        after=gap(gone, rng) if named and gone is not None else rms,
+        after=gap(gone.residual_pct, gone.noise_pct, rng) if named and gone is not None else rms,
         noise_pct=float(np.sqrt(np.mean(before.noise_pct**2)))
         if before is not None
         else _noise_pct(model.evidence),
@@ -349,8 +349,7 @@ def _before_refit(best: EffectFit, rng: np.random.Generator) -> Interval:
         mean = float(disc.share @ (disc.residual - disc.jacobian[base].T @ best.step.values[: len(base)]))
         rows.append((-100 * mean / disc.level, 100 * disc.mean_noise / disc.level))
     residual, noise = np.array(rows).T
-    nothing = np.zeros_like(residual)
-    return gap(HeldOut((), nothing, nothing, nothing, nothing, residual, noise), rng)
+    return gap(residual, noise, rng)
 
 
 def _noise_pct(evidence: Evidence) -> float:

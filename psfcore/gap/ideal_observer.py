@@ -62,7 +62,7 @@ from psfcore.gap.evidence.unocculted_blocks import UnoccultedBlocks, unocculted_
 from psfcore.gap.library.registry import LIBRARY
 from psfcore.gap.view import View
 from psfcore.scatter.inversion import invert
-from psfcore.scatter.reconstruction import Progress, Solution, dark_pixels
+from psfcore.scatter.reconstruction import Solution, dark_pixels
 from psfcore.transit.folder import read_transit
 from psfcore.transit.transit import Transit
 
@@ -113,25 +113,21 @@ class IdealObserver:
 
 
 def ideal_observer(
-    with_effects: Transit,
-    without_effects: Transit,
-    library: Sequence[Effect],
-    *,
-    threads: int = 1,
-    progress: Progress = lambda stage, step, steps: None,
+    with_effects: Transit, without_effects: Transit, library: Sequence[Effect]
 ) -> IdealObserver:
     """What the ideal observer of a transit could know. Both transits: noise-free images that state the noise of real ones.
 
     Raises the errors of `psfcore.scatter.inversion.invert`, and "bad-effects".
     """
-    found = invert(with_effects, threads=threads, progress=progress)
+    found = invert(with_effects)
     # This fit does not start at the PSF of `found`: a strong effect can change that PSF so much that the fit would fail.
-    clean = invert(without_effects, threads=threads, progress=progress)
+    clean = invert(without_effects)
     solution = _at_places_of(clean, found)
-    evidence = gather(solution, library, progress=progress)
+    evidence = gather(solution, library)
     sampling = _sampling_residuals(evidence, solution, clean)
     blocks = _without_sampling(
-        evidence.unocculted, unocculted_blocks(View(clean), len(evidence.base), progress)
+        evidence.unocculted,
+        unocculted_blocks(View(clean), len(evidence.base), lambda stage, step, steps: None),
     )
     discs = tuple(
         replace(disc, residual=disc.residual - residual)

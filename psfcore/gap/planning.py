@@ -120,7 +120,6 @@ def planned_limits(
     plan: Plan,
     diffraction: Kernel,
     *,
-    scatter: ScatterTruth = SCATTER,
     library: Sequence[Effect] = LIBRARY,
     seed: int = 1,
     threads: int = 1,
@@ -131,8 +130,8 @@ def planned_limits(
     Raises DataError "too-few-images", and the errors of `true_sky` and `invert`.
     """
     _check_images(plan)
-    transit = _noise_free(plan, scatter, diffraction, seed, threads)
-    start = SOFTENED_POWER_LAW.coordinates({"b_px": scatter.b_px, "c": scatter.c, "total": scatter.total})
+    transit = _noise_free(plan, diffraction, seed, threads)
+    start = SOFTENED_POWER_LAW.coordinates({"b_px": SCATTER.b_px, "c": SCATTER.c, "total": SCATTER.total})
     solution = invert(transit, start=start, near=True, threads=threads, progress=progress)
     model, _ = linear_model_of(View(solution), library, seed=seed, progress=progress)
     model = _without_measured(model)
@@ -155,8 +154,8 @@ def _check_images(plan: Plan) -> None:
         )
 
 
-def _noise_free(plan: Plan, scatter: ScatterTruth, diffraction: Kernel, seed: int, threads: int) -> Transit:
-    sky = true_sky(plan, scatter, diffraction, seed, threads=threads)
+def _noise_free(plan: Plan, diffraction: Kernel, seed: int, threads: int) -> Transit:
+    sky = true_sky(plan, SCATTER, diffraction, seed, threads=threads)
     transit = observed_transit(sky, seed).transit
     rng = np.random.default_rng([seed, _BRIGHTNESS_STREAM])
     brightness = 1 + BRIGHTNESS_SPREAD * rng.normal(size=len(plan.shots))

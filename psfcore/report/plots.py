@@ -30,11 +30,11 @@ from psfcore.evaluation.plots import (
     draw_maps,
     draw_offsets,
     draw_slices,
-    each,
     pointings,
     positions,
     shown_slices,
 )
+from psfcore.evaluation.report import each
 from psfcore.report.report import CrossValidated, PsfReport
 from psfcore.scatter.fit import RADII_PX, TransitFit
 from psfcore.scatter.shapes import Vector

@@ -347,24 +347,32 @@ def _counted(count: int, noun: str) -> str:
 
 def fitted_psf(fit: TransitFit, *, name: str, version: str, provenance: dict[str, Any]) -> Psf:
     """The fitted PSF, on the full reach (2048 px x 2048 px), with its components DIFFRACTION and SCATTER."""
+    named = {"name": name, "version": version, "provenance": provenance}
+    return psf_of_fit(fit.kernel, fit.scatter, fit.solution, fit.covariance, **named)
+
+
+def psf_of_fit(
+    kernel: Kernel, scatter: Kernel, solution: Solution, covariance: NDArray[np.float64], **named: Any
+) -> Psf:
+    """A draft PSF with the fitted shape of a solution and the components DIFFRACTION and SCATTER.
+
+    covariance: of the coordinates. named: further fields of `Psf`.
+    """
+    transit, inversion = solution.transit, solution.inversion
+    diffraction = crop_or_pad(transit.diffraction, kernel.shape[0])
     return Psf(
-        kernel=fit.kernel,
-        name=name,
-        version=version,
-        instrument=fit.transit.instrument,
+        kernel=kernel,
+        instrument=transit.instrument,
         status="draft",
-        plate_scale_arcsec=fit.transit.plate_scale_arcsec,
-        components={
-            "DIFFRACTION": crop_or_pad(fit.transit.diffraction, REACH_GRID_PX),
-            "SCATTER": fit.scatter,
-        },
-        provenance=provenance,
+        plate_scale_arcsec=transit.plate_scale_arcsec,
+        components={"DIFFRACTION": diffraction, "SCATTER": scatter},
         fitted=FittedShape(
-            shape=fit.inversion.shape.name,
-            parameters=fit.inversion.shape.names,
-            coordinates=tuple(fit.inversion.coordinates.tolist()),
-            covariance=tuple(tuple(row) for row in fit.covariance.tolist()),
+            shape=inversion.shape.name,
+            parameters=inversion.shape.names,
+            coordinates=tuple(inversion.coordinates.tolist()),
+            covariance=tuple(tuple(row) for row in covariance.tolist()),
         ),
+        **named,
     )
 
 

@@ -247,16 +247,8 @@ class _TarInput:
     def __init__(self, file: BinaryIO, gate: Gate, size: int | None = None) -> None:
         self._file, self._gate, self._size = file, gate, size
         self._at = 0
-        self._header_bytes_left: int | None = _MAX_HEADER_BYTES  # None: reading a member's data
+        self.header_bytes_left: int | None = _MAX_HEADER_BYTES  # None: the data of a member are read
         self.pax_text_is_next = False
-
-    def expect_headers(self) -> None:
-        """Announce that only headers are read until ``expect_data`` is called."""
-        self._header_bytes_left = _MAX_HEADER_BYTES
-
-    def expect_data(self) -> None:
-        """Announce that the data of a member are read next."""
-        self._header_bytes_left = None
 
     def tell(self) -> int:
         return self._at
@@ -274,14 +266,14 @@ class _TarInput:
         return self._at
 
     def read(self, count: int) -> bytes:
-        if self._header_bytes_left is not None:
-            if not 0 <= count <= self._header_bytes_left:
+        if self.header_bytes_left is not None:
+            if not 0 <= count <= self.header_bytes_left:
                 message = (
                     f"expected at most {_MAX_HEADER_BYTES} bytes of headers for one member; got more: pack the files again, "
                     "for example as .zip"
                 )
                 raise DataError("archive-broken", message)
-            self._header_bytes_left -= count
+            self.header_bytes_left -= count
         got = self._counted(count)
         if self.pax_text_is_next:
             self.pax_text_is_next = False
@@ -354,9 +346,9 @@ def _tar_members(source: _TarInput, gate: Gate) -> Iterator[Member]:
         errors="surrogateescape",
     ) as archive:
         while True:
-            source.expect_headers()
+            source.header_bytes_left = _MAX_HEADER_BYTES
             info = archive.next()
-            source.expect_data()
+            source.header_bytes_left = None
             if info is None:
                 return
             # Each member gets a copy of the global records.

@@ -21,7 +21,7 @@ from psfcore.gap.evidence.evidence import Evidence, gather, residuals_at
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
 from psfcore.gap.view import View
 from psfcore.scatter.inversion import invert
-from psfcore.scatter.reconstruction import Progress
+from psfcore.scatter.reconstruction import Progress, labelled
 from psfcore.transit.transit import Transit
 
 SMALLEST_SCALE, LARGEST_SCALE = 1.0, 3.0  # of `LinearModel.disc_scale` and `unocculted_scale`
@@ -80,20 +80,16 @@ def linear_model_of(
 
 def _expected_gap(view: View, evidence: Evidence, seed: int, progress: Progress) -> ExpectedGap:
     """The expected gap from one simulation. view, evidence: of the fit."""
-    solution = view.solution
-
-    def say(stage: str, step: int, steps: int) -> None:
-        progress(f"expected gap: {stage}", step, steps)
-
+    solution, told = view.solution, labelled(progress, "expected gap")
     again = invert(
         simulated(view, seed),
         solution.inversion.shape,
         start=solution.inversion.coordinates,
         near=True,
         threads=solution.threads,
-        progress=say,
+        progress=told,
     )
-    model = LinearModel(residuals_at(View(again), evidence, progress=say), FLOOR)
+    model = LinearModel(residuals_at(View(again), evidence, progress=told), FLOOR)
     left = model.left(model.base)
     cells = max(sum(one.size for one in left) - len(model.base.columns), 1)
     unocculted = model.evidence.all_unocculted

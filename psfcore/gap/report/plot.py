@@ -182,7 +182,7 @@ def cells_png(found: Diagnosis) -> bytes:
 def draw_cells(figure: Any, found: Diagnosis) -> None:
     """Draw each cell as a sector of a ring. The second chart, if effects are named, shows the model with the named effects."""
     charts = _panels(figure, bool(found.corrected))
-    evidences = [found.evidence, *(one.evidence for one in found.corrected[:1])]
+    evidences = [found.evidence, *(one.model.evidence for one in found.corrected[:1])]
     maps = [cell_means(evidence.discs) for evidence in evidences]
     top = _scale(*maps[0])
     for axes, (means, errors) in zip(charts, maps, strict=True):

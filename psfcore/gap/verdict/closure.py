@@ -242,14 +242,14 @@ def fall(before: HeldOut, after: HeldOut) -> float:
     )
 
 
-def gap(held_out: HeldOut, rng: np.random.Generator) -> Interval:
-    """Eq. (3) with its 90 % interval.
+def gap(residual_pct: Vector, noise_pct: Vector, rng: np.random.Generator) -> Interval:
+    """Eq. (3) with its 90 % interval. residual_pct, noise_pct: of each image, as in `HeldOut`.
 
     Its upper end is never below the largest gap that the noise could hide.
     """
-    squares = held_out.residual_pct**2 - held_out.noise_pct**2
+    squares = residual_pct**2 - noise_pct**2
     chosen = rng.integers(0, squares.size, (RESAMPLES, squares.size))
     resampled = np.sqrt(np.maximum(squares[chosen].mean(axis=1), 0.0))
     low, high = np.percentile(resampled, INTERVAL)
-    hidden = math.sqrt(HIDDEN_SIGMA * math.sqrt(2 * float(np.mean(held_out.noise_pct**4)) / squares.size))
+    hidden = math.sqrt(HIDDEN_SIGMA * math.sqrt(2 * float(np.mean(noise_pct**4)) / squares.size))
     return Interval(math.sqrt(max(float(squares.mean()), 0.0)), float(low), max(float(high), hidden))

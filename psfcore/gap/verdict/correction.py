@@ -49,7 +49,6 @@ class Corrected:
 
     effects: tuple[Effect, ...]
     solution: Solution
-    evidence: Evidence
     model: LinearModel
     values: dict[str, tuple[float, float, str]]
     subtracted: dict[str, tuple[float, ...]]
@@ -73,8 +72,9 @@ class Corrected:
     @property
     def covariance(self) -> Vector:
         """Covariance of the coordinates of the PSF, with the parameters of the effects free (coordinates, coordinates)."""
-        columns = tuple(c for effect in self.effects for c in self.evidence.columns[effect.name])
-        base = len(self.evidence.base)
+        evidence = self.model.evidence
+        columns = tuple(c for effect in self.effects for c in evidence.columns[effect.name])
+        base = len(evidence.base)
         return self.model.fit(columns).covariance[:base, :base]
 
 
@@ -194,7 +194,6 @@ def _corrected(
     return Corrected(
         effects=tuple(held),
         solution=taken.solution,
-        evidence=own.evidence,
         model=own,
         values={name: (float(value), sigma, unit) for (name, (_, sigma, unit)), value in fitted},
         subtracted=_by_effect(held, np.where(in_images, taken.theta, 0.0)),

@@ -37,7 +37,7 @@ from psfcore.gap.evidence.linear_model import LinearModel
 from psfcore.gap.verdict.correction import Corrected, add_to_model
 from psfcore.gap.verdict.posterior import NONE, Form, Posterior, at_refit, kind_of, name_of
 from psfcore.gap.view import View, return_unused_memory
-from psfcore.scatter.reconstruction import Progress
+from psfcore.scatter.reconstruction import Progress, labelled
 
 MOST_TRIES = 2
 MOST_REFITS = 3  # for example, an effect alone, a pair that contains it, and a rival
@@ -129,16 +129,13 @@ class Refits:
                     model,
                     beside=beside,
                     view=self._view,
-                    progress=self._say(f"full refit with {label}"),
+                    progress=labelled(self._progress, f"full refit with {label}"),
                 )
             except DataError as error:  # the fit may fail if the subtracted effect is not in the images
                 self.failures.append(f"The full refit with {label} in the model failed: {error}")
                 self._made[form] = None
             return_unused_memory()
         return self._made[form]
-
-    def _say(self, what: str) -> Progress:
-        return lambda stage, step, steps: self._progress(f"{what}: {stage}", step, steps)
 
 
 def linear_start(model: LinearModel, effects: Sequence[Effect]) -> EffectFit:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 from textwrap import dedent
@@ -17,9 +16,7 @@ from psfcore.blind.score import score
 from psfcore.blind.simulator import checked_truth, simulator_of, source_sha256
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits
-from psfcore.gap import ideal_observer
 from psfcore.transit.folder import read_transit
-from tests.psfcore.gap.small_gaps import effect
 
 SIZE_PX, IMAGES = 96, 9
 # A simulator that writes a transit of the tests.
@@ -42,28 +39,17 @@ def plan_of(source: str, cases: int = 1) -> SetPlan:
     return SetPlan(cases, 3, SIZE_PX, IMAGES, simulator=source)
 
 
-def test_the_example_of_the_documentation_makes_cases_that_an_ideal_observer_understands(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(ideal_observer, "LIBRARY", [effect("intensity_gradient"), effect("dark_offset")])
+def test_the_example_of_the_documentation_makes_cases(tmp_path: Path) -> None:
     page = (Path(__file__).parents[3] / "docs" / "gap.md").read_text("utf-8")
     (example,) = (one for one in re.findall(r"```python\n(.*?)```", page, re.S) if "def make_case" in one)
     made, failed = make_set(tmp_path / "set", plan_of(source_in(tmp_path, example), cases=2))
     assert failed == {}
     clean, leak = made.truth(0), made.truth(1)
     assert (clean["kind"], clean["left_after_refit_pct"], leak["kind"]) == ("clean", 0.0, "single")
-    assert not made.expected(0).exists()
+    assert not made.expected(0).exists() and made.expected(1).is_dir()
     limits = FitsLimits(max_pixels=(2 * SIZE_PX + 1) ** 2)  # the known PSF is larger than the images
     for number in (0, 1):
         assert len(read_transit(made.transit(number), limits).frames) == IMAGES
-    assert ideal_observer.main([str(made.expected(1)), str(made.ideal(1))]) == 0
-    found = json.loads(made.ideal(1).read_text())
-    left = {tuple(one["effects"]): one["chi2"] for one in found["hypotheses"]}
-    assert left[()] == found["noncentrality"] > 30
-    assert left[("intensity_gradient",)] < 0.05 * left[()]
-    case = Judged(1, leak, {"verdict": "none"}, 1.0, found)
-    assert case.left_pct == found["left_after_refit_pct"] > 1
-    assert case.known is not None and case.known.alone > 0.5
 
 
 def test_a_simulated_case_is_sealed_and_told_what_was_asked(

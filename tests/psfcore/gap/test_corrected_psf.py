@@ -42,8 +42,10 @@ def corrected(*effects: Effect, values: tuple[float, ...]) -> Psf:
     names = [f"{one.name}.{p.name}" for one in effects for p in one.parameters]
     numbers = {name: (value, 0.1, "") for name, value in zip(names, values, strict=True)}
     added = found().corrected[0]
-    evidence = replace(added.evidence, columns={one.name: () for one in effects})  # used only for errors
-    added = replace(added, effects=effects, values=numbers, evidence=evidence)
+    # The columns are used only for errors; effects that are not in the catalogue have none.
+    columns = {one.name: () for one in effects} | added.model.evidence.columns
+    model = replace(added.model, evidence=replace(added.model.evidence, columns=columns))
+    added = replace(added, effects=effects, values=numbers, model=model)
     return psf_of(replace(found(), corrected=(added,)))
 
 

@@ -147,15 +147,6 @@ def test_pixels_are_counted_in_compressed_files_too(folder: Path, tmp_path: Path
     assert transit_in(folder).contents.pixels == 3 * pixels.size
 
 
-def test_long_and_foreign_names_in_a_tar(tmp_path: Path) -> None:
-    long = ["a" * 200 + ".fits", "Ü.fits"]
-    forms = {tarfile.PAX_FORMAT: long, tarfile.GNU_FORMAT: long, tarfile.USTAR_FORMAT: ["a" * 90 + ".fits"]}
-    for form, names in forms.items():
-        path = as_tar(tmp_path / "a.tar", [(name, b"1234") for name in names], form=form)
-        assert unpack(path, tmp_path / f"{form}", LIMITS) == tuple(names)
-        assert (tmp_path / f"{form}" / names[0]).read_bytes() == b"1234"
-
-
 def test_the_first_bytes_tell_the_kind(folder: Path, tmp_path: Path) -> None:
     for kind, make in (("zip", as_zip), ("tar", as_tar), ("gzip", as_tar_gz)):
         start = make(tmp_path / kind, members_of(folder)).read_bytes()[:START_BYTES]
@@ -538,20 +529,15 @@ def test_equal_folders_are_packed_to_equal_bytes(folder: Path, tmp_path: Path) -
 
 def test_all_bad_files_are_named_in_one_error_and_nothing_is_written(folder: Path, tmp_path: Path) -> None:
     (folder / "002.fits").write_text("a letter")
-    checks = (transit_in, lambda folder: pack(folder, tmp_path / "t.tar"))
-    for check in checks:
-        with pytest.raises(DataError, match=r"002\.fits") as caught:
+    for name in ("001.fits", "diffraction.fits"):
+        (folder / name).unlink()
+    for check in (transit_in, lambda folder: pack(folder, tmp_path / "t.tar")):
+        with pytest.raises(DataError, match=r"missing-file: 3 files cannot be used") as caught:
             check(folder)
-        assert caught.value.code == "not-fits"
-    (folder / "001.fits").unlink()
-    (folder / "diffraction.fits").unlink()
-    for check in checks:
-        with pytest.raises(DataError) as caught:
-            check(folder)
-        assert caught.value.code == "missing-file"
-        for name in ("3 files cannot be used", "001.fits", "002.fits", "diffraction.fits"):
-            assert name in caught.value.message
-        assert "000.fits" not in caught.value.message
+        names = [
+            name for name in ("000", "001", "002", "diffraction") if f"{name}.fits" in caught.value.message
+        ]
+        assert names == ["001", "002", "diffraction"]
     assert not (tmp_path / "t.tar").exists()
     with pytest.raises(DataError, match="no-manifest"):
         transit_in(tmp_path)

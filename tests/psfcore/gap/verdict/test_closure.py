@@ -74,8 +74,8 @@ def test_closure_its_interval_gap_and_fall_by_hand() -> None:
     before, after = of_images(110.0, 10.0, residual_pct=5.0), of_images(20.0, 10.0, residual_pct=1.0)
     found = closure(before, after, rng)
     assert found is not None and found.value == pytest.approx(0.9)  # 1 - 10 / 100
-    assert gap(before, rng).value == pytest.approx(np.sqrt(24.0))
-    assert gap(after, rng).value == 0.0
+    assert gap(before.residual_pct, before.noise_pct, rng).value == pytest.approx(np.sqrt(24.0))
+    assert gap(after.residual_pct, after.noise_pct, rng).value == 0.0
     assert closure(of_images(9.0, 10.0), after, rng) is None
     # A decrease of deviance uses the common folds.
     first = replace(before, deviance={(0,): 30.0, (1,): 20.0})

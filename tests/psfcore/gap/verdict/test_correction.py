@@ -61,10 +61,12 @@ def test_a_round_that_leaves_more_than_the_previous_one_is_rejected(monkeypatch:
     assert added.parameters("dark_offset") == {"offset": (value, sigma)}
     assert added.subtracted["dark_offset"] == pytest.approx((1.0,), abs=4 * sigma)
     # Noise and reference level are those of the images before the subtraction.
-    for before, after in zip(model.evidence.discs, added.evidence.discs, strict=True):
+    for before, after in zip(model.evidence.discs, added.model.evidence.discs, strict=True):
         assert after.level == before.level
         np.testing.assert_array_equal(after.covariance, before.covariance)
-    np.testing.assert_array_equal(added.evidence.unocculted.variance, model.evidence.unocculted.variance)
+    np.testing.assert_array_equal(
+        added.model.evidence.unocculted.variance, model.evidence.unocculted.variance
+    )
 
 
 def test_a_refit_of_several_rounds_computes_the_jacobian_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -89,8 +91,8 @@ def test_a_refit_of_several_rounds_computes_the_jacobian_once(monkeypatch: pytes
     assert added.beside is not None
     assert [e.name for e in added.beside.evidence.effects] == ["intensity_gradient", "dark_offset"]
     alone = gather(added.solution, added.effects)
-    assert added.evidence.columns == alone.columns and added.evidence.size == alone.size
-    for made, again in zip(added.evidence.discs, alone.discs, strict=True):
+    assert added.model.evidence.columns == alone.columns and added.model.evidence.size == alone.size
+    for made, again in zip(added.model.evidence.discs, alone.discs, strict=True):
         assert made.residual == pytest.approx(again.residual)
         assert made.jacobian == pytest.approx(again.jacobian)
 
