@@ -341,3 +341,12 @@ def test_other_sizes_and_unknown_components_are_refused() -> None:
     with pytest.raises(DataError, match=r"AIRY, ENTRANCE, .*; got 'SCATTER'") as caught:
         build_psf(SMALL, component="SCATTER")
     assert caught.value.code == "unknown-component"
+
+
+@pytest.mark.slow
+def test_4096_px_hold_the_2048_px_psf(hri_psf: Psf) -> None:
+    larger = build_psf(HRI, size=4096, component="DIFFRACTION", threads=2)
+    full = hri_psf.components["DIFFRACTION"]
+    middle = larger.kernel[1024:3072, 1024:3072]
+    assert np.abs(middle - full).sum() < 1e-5
+    assert 1 < larger.kernel.sum() < 1.002

@@ -61,3 +61,18 @@ def test_the_block_waits_for_the_process_and_an_error_ends_it(
     with pytest.raises(InterruptedError), kernels.compiling_beside("linear", (64, 96)):
         raise InterruptedError
     assert started[1].killed
+
+
+@pytest.mark.slow  # compiles for some seconds
+def test_the_process_compiles_what_a_later_process_needs(
+    tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    command = [sys.executable, "-m", "psfcore.deconvolve.kernels", "richardson-lucy", "1024", "1024"]
+    subprocess.run(command, check=True)
+    kept = set(tmp_path.rglob("*.nbc"))
+    subprocess.run(command, check=True)
+    assert kept and set(tmp_path.rglob("*.nbc")) == kept
+    assert len(list(tmp_path.rglob("*forward_4*"))) == 1, (
+        "a row of 1024 px is transformed with 2048 px, 4 x 8 x 8 x 8"
+    )

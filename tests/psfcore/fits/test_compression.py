@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import gzip
+import resource
+import subprocess
+import sys
 import tracemalloc
 from collections.abc import Callable
 from itertools import cycle, product
@@ -17,6 +20,7 @@ from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.header import read_summary
 from psfcore.fits.observation import read_observation
 from psfcore.fits.psfs import read_psf
+from tests.conftest import REPOSITORY
 from tests.fits_bombs import lying_tiles, psf_with_a_tail
 from tests.psfcore.fits.raw_files import block, compressed, empty_primary, good, image_cards
 
@@ -83,9 +87,8 @@ def test_a_count_or_parameter_outside_the_standard_is_refused_in_the_header(
 ) -> None:
     for name, content in BAD_CARDS.items():
         (tmp_path / "file.fits").write_bytes(content)
-        for read in (read_summary, read_observation):
-            with subtests.test(name), pytest.raises(HeaderError, match=r"^bad-card: .*expected.*got"):
-                read(tmp_path / "file.fits", LIMITS)
+        with subtests.test(name), pytest.raises(HeaderError, match=r"^bad-card: .*expected.*got"):
+            read_summary(tmp_path / "file.fits", LIMITS)
 
 
 def test_tiles_are_counted(tmp_path: Path) -> None:
@@ -97,6 +100,56 @@ def test_tiles_are_counted(tmp_path: Path) -> None:
         (tmp_path / "file.fits").write_bytes(compressed(**changes) + bytes(8 * 90_000))
         with pytest.raises(HeaderError, match=limit):
             read_summary(tmp_path / "file.fits", LIMITS)
+
+
+def replaced(content: bytes, key: str, value: object) -> bytes:
+    """The file with another value in a card of its second header."""
+    at = content.index(key.ljust(8).encode() + b"=", content.index(b"XTENSION"))
+    return content[:at] + f"{key:<8}= {value:>20}".ljust(80).encode() + content[at + 80 :]
+
+
+READER = """
+import sys
+from psfcore.errors import DataError
+from psfcore.fits.header import FitsLimits
+from psfcore.fits.observation import read_observation
+for path in sys.argv[1:]:
+    try:
+        print(read_observation(path, FitsLimits(max_pixels=10**6)).pixels.shape)
+    except DataError as error:
+        print(error.code)
+"""
+
+
+def test_the_decoder_never_sees_what_it_cannot_handle(tmp_path: Path) -> None:
+    """In a process that may use 600 MiB of private memory, because a wrong parameter could crash the decoder.
+
+    With BYTEPIX 8, it would return as much memory of the process as pixels. astropy makes a list of TFIELDS columns, and
+    looks at the second HDU when it opens a file.
+    """
+    pixels = np.arange(40 * 50, dtype=np.int16).reshape(40, 50)
+    packed = fits.CompImageHDU(pixels, compression_type="RICE_1")
+    fits.HDUList([fits.PrimaryHDU(), packed]).writeto(tmp_path / "good.fits")
+    content = (tmp_path / "good.fits").read_bytes()
+    cases = [
+        *(
+            (replaced(replaced(content, "ZVAL1", blocksize), "ZVAL2", bytepix), "bad-card")
+            for bytepix, blocksize in ((8, 32), (2, 2**24), (-1, 32), (2, 0))
+        ),
+        *((compressed(TFIELDS=fields), "bad-card") for fields in (2**32, 2**40)),
+        (good() + compressed(TFIELDS=2**32)[2880:], "no-signal"),
+    ]
+    for number, (file, _) in enumerate(cases):
+        (tmp_path / f"{number}.fits").write_bytes(file)
+    done = subprocess.run(
+        [sys.executable, "-c", READER, *(str(tmp_path / f"{number}.fits") for number in range(len(cases)))],
+        cwd=REPOSITORY,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_DATA, (600 * MIB, 600 * MIB)),
+    )
+    assert done.stdout.split() == [code for _, code in cases], f"{done.returncode}: {done.stderr}"
 
 
 RNG = np.random.default_rng(0)

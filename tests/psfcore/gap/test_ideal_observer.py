@@ -1,17 +1,19 @@
-"""The ideal observer: an effect that the library knows leaves nothing, and its rivals much."""
+"""The ideal observer: what hypotheses leave, compared with dense least squares; an effect that the library knows leaves nothing."""
 
 from __future__ import annotations
 
 from functools import cache
 
+import numpy as np
 import pytest
 
 from psfcore.gap.evidence.evidence import Evidence
+from psfcore.gap.evidence.linear_model import UNLIKELY
 from psfcore.gap.ideal_observer import IdealObserver, Left, ideal_observer, left_by_hypotheses
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.transit import SimulatedTransit, simulate
 from psfcore.transit.transit import Transit
-from tests.psfcore.gap.linear_models import FEW, with_residuals
+from tests.psfcore.gap.linear_models import FEW, dense, effect_of, with_residuals
 from tests.psfcore.gap.small_gaps import changed
 from tests.transit_files import TRUTH, diffraction
 
@@ -54,6 +56,19 @@ def test_the_true_effect_leaves_nothing_and_its_rival_much() -> None:
     assert told["noncentrality"] == told["hypotheses"][0]["chi2"]
     names = [tuple(one["effects"]) for one in told["hypotheses"]]
     assert len(set(names)) == len(names) == 4
+
+
+def test_every_hypothesis_leaves_what_dense_least_squares_leave(evidence: Evidence) -> None:
+    model = with_residuals(evidence, {"dark_offset": 0.3}, noise=1.0)
+    jacobian, residual = dense(model)
+    base, (column,) = list(evidence.base), evidence.columns["dark_offset"]
+    prior = np.zeros((1, len(base) + 1))
+    prior[0, -1] = 1 / (UNLIKELY * effect_of(evidence, "dark_offset").parameters[0].likely)
+    designs = {(): jacobian[:, base], ("dark_offset",): np.vstack([jacobian[:, [*base, column]], prior])}
+    for names, design in designs.items():
+        data = np.append(residual, np.zeros(len(names)))
+        rest = data - design @ np.linalg.lstsq(design, data, rcond=None)[0]
+        assert left_of(left_by_hypotheses(model), *names).chi2 == pytest.approx(float(rest @ rest), rel=1e-6)
 
 
 def test_a_negative_share_of_light_is_no_rival(evidence: Evidence) -> None:

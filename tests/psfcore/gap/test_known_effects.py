@@ -7,7 +7,8 @@ import pytest
 
 from psfcore.blind.effects.scene import patches
 from psfcore.gap.diagnose import Diagnosis, diagnose
-from psfcore.gap.verdict.posterior import Form
+from psfcore.gap.report.report import gap_report
+from psfcore.gap.verdict.posterior import NONE, UNKNOWN, Form
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.transit import simulate
 from psfcore.transit.transit import Frame, Transit
@@ -87,3 +88,19 @@ def test_a_sun_that_changes_faster_than_the_images_follow_is_still_named() -> No
     assert any("The fitted position of the occulter may be wrong" in caution for caution in found.cautions)
     assert all("scene_evolution" in names for names in found.judgement.members)
     assert next(iter(found.fits)) == Form(("scene_evolution",))
+
+
+def test_a_patch_of_light_is_not_attributed_to_an_effect(clean: Transit) -> None:
+    ny, nx = clean.shape
+    glow = 40 * np.exp(-0.5 * ((np.arange(nx) - 60) / 14) ** 2) * np.ones((ny, 1))
+    found = verdict(changed(clean, lambda n, f: f.pixels + glow))
+    assert UNKNOWN in found.judgement.members
+    first = gap_report(found)["unknown"]["fields"][0]
+    assert (first["stage"], first["form"]) == ("detector", "light")
+
+
+def test_brightness_that_varies_between_images_is_not_a_gap(clean: Transit) -> None:
+    waver = 1 + 0.01 * np.random.default_rng(3).standard_normal(len(clean.frames))
+    found = verdict(changed(clean, lambda n, f: f.pixels * waver[n]))
+    assert found.judgement.members[0] == NONE and found.judgement.answer == ()
+    assert found.p_value > 1e-3

@@ -1,15 +1,19 @@
-"""The view: scenes of the images."""
+"""The view: scenes of the images; and memory that views no longer need goes back to the system."""
 
 from __future__ import annotations
 
+import ctypes
 from copy import copy
 from dataclasses import replace
 
 import numpy as np
+import psutil
 import pytest
 
-from psfcore.gap.view import View
+from psfcore.gap.view import View, return_unused_memory
 from tests.psfcore.gap.small_gaps import changed, clean, fit, solution
+
+MIB = 2**20
 
 
 def test_a_scene_has_the_brightness_of_its_own_image() -> None:
@@ -25,3 +29,32 @@ def test_a_scene_has_the_brightness_of_its_own_image() -> None:
         sky.scenes = [np.float32(by) * scene for by, scene in zip(factors, sky.scenes, strict=True)]
         scene = View(replace(solution(), sky=sky)).scenes[1]
         assert np.abs(scene).max() < 1e-6 * np.abs(view.scenes[1]).max(), (of_one, of_others)
+
+
+class Planes:
+    """Planes that refer to themselves, as the fields of a view do."""
+
+    def __init__(self, count: int) -> None:
+        self.planes = [np.ones(MIB // 8) for _ in range(count)]
+        self.own = self
+
+
+@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="the C library is not glibc")
+def test_freed_blocks_between_blocks_in_use_go_back_to_the_system() -> None:
+    # From now on, blocks below 30 MiB stay in the heap when they are freed.
+    block = np.ones(30 * MIB // 8)
+    del block
+    return_unused_memory()
+    process = psutil.Process()
+    before = process.memory_info().rss
+    kept, freed = [], []
+    for _ in range(100):
+        freed.append(Planes(2))
+        kept.append(np.ones(1000))
+    with_all = process.memory_info().rss
+    freed.clear()
+    return_unused_memory()
+    after = process.memory_info().rss
+    assert with_all - before > 190 * MIB
+    assert after - before < 20 * MIB
+    assert len(kept) == 100

@@ -183,6 +183,16 @@ def test_a_pixel_is_the_sum_of_the_definition(beyond: TrueSky) -> None:
         assert expected[y, x] == pytest.approx((weights * diffracted).sum(), rel=1e-9)
 
 
+def test_the_occulter_is_dark_in_the_true_scene_and_lit_by_scatter(small: SimulatedTransit) -> None:
+    for index in range(6):
+        dark = fully_dark(small.plan.place(index), (0, 0), (96, 96))
+        assert true_scene(small.sky, index)[dark].max() < 1e-9
+        assert small.sky.noise_free[index][dark].min() > 0
+        lit = covered_share(small.plan.place(index), (0, 0), (96, 96)) == 0
+        pointing = small.plan.shots[index].pointing
+        np.testing.assert_array_equal(true_scene(small.sky, index)[lit], small.sky.scenes[pointing][lit])
+
+
 def test_half_pixels_are_binned_after_the_disc_is_removed() -> None:
     """Light in one half pixel; the edge of the disc is between it and the other half."""
     plan = default_plan(1, 64)

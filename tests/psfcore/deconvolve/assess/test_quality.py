@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from psfcore.deconvolve.assess.changes import QualityBit, quality_plane
+from psfcore.deconvolve.assess.changes import NEAR_MASKED_PX, QualityBit, quality_plane
 from psfcore.image import MaskBit
 from psfcore.psf import Psf
 from psfcore.simulate.scene import observe
@@ -91,3 +91,12 @@ def test_each_reason_has_its_bit() -> None:
     without = quality_plane(make_image(pixels, mask), result, edge_px=0)
     assert not (without & (QualityBit.NO_ERROR | QualityBit.EDGE)).any()
     assert all(QualityBit[str(bit.name)] == bit for bit in MaskBit), "the first bits are those of the mask"
+
+
+def test_pixels_near_masked_ones_are_those_within_the_distance() -> None:
+    mask = np.zeros((40, 50), np.uint8)
+    mask[[0, 7, 8, 39, 20], [0, 30, 30, 49, 3]] = MaskBit.SATURATED
+    image = make_image(np.ones(mask.shape), mask)
+    marked = quality_plane(image, image.pixels, edge_px=0) & QualityBit.NEAR_MASKED != 0
+    distance = distance_transform_edt(image.valid)
+    assert (marked == (image.valid & (distance <= NEAR_MASKED_PX))).all()

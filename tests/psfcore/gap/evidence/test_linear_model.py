@@ -124,8 +124,24 @@ def test_a_sensitivity_of_a_cell_is_the_adjoint_of_the_estimate(
     assert backwards == pytest.approx(forwards, abs=1e-4)
 
 
-def test_sensitivities_show_no_global_gain(solution: Solution) -> None:
-    view, n = View(solution), solution.part[2]
+def test_sensitivities_predict_an_added_error_and_no_global_gain(
+    solution: Solution,
+) -> None:
+    n = solution.part[3]
+    found, planes = disc_cells(solution, n)
+    error = np.full(solution.transit.shape, 5.0, np.float32)
+    place = solution.sky.found[n].place
+    weights = cells_of(solution.sky.dark[n], place.x_px, place.y_px).weights
+    optics, dark = solution.optics, solution.sky.dark[n]
+    lanes = optics.lanes(solution.transit.frames[n].pixels + error)
+    scene = optics.invert(lanes, steps=8)
+    put(scene, dark, 0.0)
+    after = weights @ (pick(lanes, dark) - pick(optics.convolve(scene), dark))
+    expected = np.einsum("cyx,yx->c", planes, error)
+    assert np.abs(expected).max() > 0.5
+    assert after - found.residual == pytest.approx(expected, abs=0.05 * float(np.abs(expected).max()))
+    view = View(solution)
+    n = solution.part[2]
     found, planes = disc_cells(solution, n)
     moved = np.einsum("cyx,yx->c", planes, view.expected[n])
     assert np.abs(moved).max() < 0.01 * float(found.expected.mean())

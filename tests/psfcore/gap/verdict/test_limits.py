@@ -61,6 +61,20 @@ def names_it(model: LinearModel, name: str, columns: FieldColumns) -> bool:
     return NONE not in answer and (name,) in answer
 
 
+@pytest.mark.slow  # the strength of a noncentral chi2 below is the fast case, and the fit of the effect that of what is excluded
+def test_an_effect_of_this_strength_is_found_nine_times_in_ten_and_rarely_excluded(
+    model: LinearModel, columns: FieldColumns, limits_of: Of
+) -> None:
+    """With noise drawn anew each time, by the answer that the posterior itself gives."""
+    for name in ("dark_offset", "column_smear"):
+        true = strength_of(limits_of(model), name)
+        seen = [drawn(model, {(name, 0): true}, seed) for seed in range(DRAWS)]
+        assert 0.82 <= sum(names_it(one, name, columns) for one in seen) / DRAWS <= 0.97, name
+        excluded = [limits_of(one).effects[name].parameters[0].excluded_95 for one in seen]
+        above = sum(true > one for one in excluded if one is not None)
+        assert above / DRAWS <= 0.05 + 2 * math.sqrt(0.05 * 0.95 / DRAWS), name
+
+
 @pytest.mark.slow
 def test_the_rms_of_a_random_field_is_found_and_bounded(
     model: LinearModel, columns: FieldColumns, limits_of: Of
