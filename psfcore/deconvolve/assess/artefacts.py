@@ -268,11 +268,6 @@ def _maxima(plane: Pixels, radius_px: int) -> Pixels:
     return _extremes(plane, radius_px, np.maximum)
 
 
-def _minima(plane: Pixels, radius_px: int) -> Pixels:
-    """Smallest value, as in ``_maxima``."""
-    return _extremes(plane, radius_px, np.minimum)
-
-
 def _extremes(plane: Pixels, radius_px: int, chosen: np.ufunc) -> Pixels:
     """As the filters of scipy.ndimage, but several times as fast."""
     extremes = np.empty_like(plane)
@@ -312,7 +307,7 @@ def _bright_sources(before: Plane, counted: Flags) -> NDArray[np.int64]:
     """
     inside = np.zeros_like(counted)
     inner = np.s_[RING_RADIUS_PX:-RING_RADIUS_PX]
-    inside[inner, inner] = _minima(counted, RING_RADIUS_PX)[inner, inner]
+    inside[inner, inner] = _extremes(counted, RING_RADIUS_PX, np.minimum)[inner, inner]
     peaks = np.argwhere(inside & (before == _maxima(before, RING_RADIUS_PX)))
     height = before[tuple(peaks.T)]
     peaks = peaks[height > 2 * np.maximum(_median_on_circle(before, peaks), 0)]

@@ -149,7 +149,7 @@ def measure_changes(
         before, after = (plane.ravel() if counted.all() else plane[counted] for plane in (seen, sharp))
         positive = counted & (image.pixels > 0)
         change_pct = _percentiles(image.pixels, result, positive, _change_pct) if positive.any() else {}
-        difference = _percentiles(image.pixels, result, counted, _difference)
+        difference = _percentiles(image.pixels, result, counted, lambda old, new: new - old)
         blocks = [_described(before, after, 1), *_larger_blocks(image.pixels, result, counted)]
         structures = tuple(row for part in blocks for row in _structures(part))
         ranges = tuple(row for part in blocks for row in _ranges(part))
@@ -319,10 +319,6 @@ def _percentiles(
         first += block.size
     levels = ranks.percentiles(values, CHANGE_PERCENTILES)
     return {f"p{level:g}": float(value) for level, value in zip(CHANGE_PERCENTILES, levels, strict=True)}
-
-
-def _difference(before: Any, after: Any) -> Any:
-    return after - before
 
 
 def _change_pct(before: Any, after: Any) -> Any:
