@@ -147,6 +147,15 @@ def test_pixels_are_counted_in_compressed_files_too(folder: Path, tmp_path: Path
     assert transit_in(folder).contents.pixels == 3 * pixels.size
 
 
+def test_long_and_foreign_names_in_a_tar(tmp_path: Path) -> None:
+    long = ["a" * 200 + ".fits", "Ü.fits"]
+    forms = {tarfile.PAX_FORMAT: long, tarfile.GNU_FORMAT: long, tarfile.USTAR_FORMAT: ["a" * 90 + ".fits"]}
+    for form, names in forms.items():
+        path = as_tar(tmp_path / "a.tar", [(name, b"1234") for name in names], form=form)
+        assert unpack(path, tmp_path / f"{form}", LIMITS) == tuple(names)
+        assert (tmp_path / f"{form}" / names[0]).read_bytes() == b"1234"
+
+
 def test_the_first_bytes_tell_the_kind(folder: Path, tmp_path: Path) -> None:
     for kind, make in (("zip", as_zip), ("tar", as_tar), ("gzip", as_tar_gz)):
         start = make(tmp_path / kind, members_of(folder)).read_bytes()[:START_BYTES]
