@@ -9,11 +9,14 @@ from __future__ import annotations
 import fcntl
 import json
 import logging
+import math
 import os
 import re
 import sys
+import threading
+import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from datetime import UTC, datetime
@@ -118,7 +121,43 @@ def _tried_again(record: logging.LogRecord) -> bool:
     return True
 
 
+class Seldom(logging.Filter):
+    """Writes at most one record of each kind in ``every_s`` seconds. The next record says how many records were left out.
+
+    Two records are of the same kind if they come from the same logger and the first lines of their message templates
+    are equal. The filter is for messages that clients without a key can cause; without it, these messages could fill
+    the disk.
+    """
+
+    def __init__(
+        self, about: Callable[[logging.LogRecord], bool] = lambda _record: True, every_s: float = 60.0
+    ) -> None:
+        """about: selects the records to which the limit applies; all other records are written."""
+        super().__init__()
+        self._about, self._every_s = about, every_s
+        self._said: dict[tuple[str, str], tuple[float, int]] = {}
+        self._lock = threading.Lock()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether the record is written."""
+        if not self._about(record):
+            return True
+        kind = (record.name, str(record.msg).partition("\n")[0])
+        now = time.monotonic()
+        with self._lock:
+            said_at, left_out = self._said.get(kind, (-math.inf, 0))
+            if now - said_at < self._every_s:
+                self._said[kind] = (said_at, left_out + 1)
+                return False
+            self._said[kind] = (now, 0)
+        if left_out:
+            record.msg = f"{record.msg} ({left_out} more such messages were left out)"
+        return True
+
+
 REQUESTS = "service.http.observation"  # the logger of answered requests
+_SELDOM_WARNINGS = Seldom(lambda record: record.levelno < logging.ERROR)
+_SELDOM_ACCEPTS = Seldom(lambda record: record.getMessage().startswith("socket.accept()"))
 
 
 def _no_request(record: logging.LogRecord) -> bool:
@@ -154,4 +193,7 @@ def configure(settings: Settings, *, verbose: bool = False) -> None:
     logging.getLogger("multiprocessing").handlers = [handler]
     for retried in ("multiprocessing", "celery.worker.consumer.consumer", "celery.worker.request"):
         logging.getLogger(retried).addFilter(_tried_again)
+    # Clients without a key can cause these: requests that are not HTTP, and more connections than the system allows.
+    logging.getLogger("uvicorn.error").addFilter(_SELDOM_WARNINGS)
+    logging.getLogger("asyncio").addFilter(_SELDOM_ACCEPTS)
     logging.captureWarnings(True)
