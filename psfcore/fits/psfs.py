@@ -177,7 +177,7 @@ def stated_id(path: str | Path, limits: FitsLimits) -> str | None:
     Also None if the file was changed after `write_psf` wrote it (CHECKSUM and DATASUM of every HDU are checked), or if
     it was derived from the file of another PSF. Raises HeaderError.
     """
-    all_hdus(path, limits)
+    count = len(all_hdus(path, limits))
     try:
         with fits.open(path, memmap=False, disable_image_compression=True) as hdus:
             lines = [str(line) for line in hdus[0].header.get("HISTORY", [])]
@@ -187,7 +187,7 @@ def stated_id(path: str | Path, limits: FitsLimits) -> str | None:
             derived = any(line.startswith("history:") for line in lines)
             if len(stated) != 1 or derived:
                 return None
-            same = all(as_written(hdu) for hdu in hdus)
+            same = all(as_written(hdus[number]) for number in range(count))
     except PIXEL_TROUBLE:  # a damaged file, or one of other software; the job that uses it raises the error
         return None
     return stated[0] if same else None
@@ -201,12 +201,13 @@ def _read_extras(
     components: dict[str, NDArray[np.float64]] = {}
     provenance: dict[str, Any] = {}
     # Any file can have a card PSFNAME. Therefore the size limits are checked for all HDUs. HDUs that write_psf never
-    # writes are ignored: compressed components, and components of another shape.
-    all_hdus(path, limits)
+    # writes are ignored: compressed components, and components of another shape. Only the HDUs that were counted are
+    # read: if a damaged size ends the file earlier, astropy takes what follows for a header, and may read on without an end.
+    count = len(all_hdus(path, limits))
     try:
         with fits.open(path, memmap=False, disable_image_compression=True) as hdus:
             provenance["history"] = [str(line) for line in hdus[0].header.get("HISTORY", [])]
-            for hdu in hdus[1:]:
+            for hdu in (hdus[number] for number in range(1, count)):
                 if isinstance(hdu, fits.ImageHDU) and hdu.shape == shape:
                     components[hdu.name] = np.array(hdu.data, dtype=np.float64)
                 elif not isinstance(hdu, fits.BinTableHDU) or _has_heap(hdu):

@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 
 from psfcore.errors import DataError
 from psfcore.fits.header import read_summary
-from psfcore.fits.psfs import read_psf, write_psf
+from psfcore.fits.psfs import read_psf, stated_id, write_psf
 from psfcore.fits.stored_psf import check_is_psf, cutout
 from psfcore.instruments.files import instrument_path
 from psfcore.psf import REACH_GRID_PX, Psf
 from psfcore.scatter.power_law import scatter_kernel
 from tests.conftest import write_image
 from tests.conftest import write_psf as write_example
+from tests.fuzz.fits_inputs import plain_image
 from tests.psfcore.conftest import LIMITS, delta, gaussian, make_psf
 
 Find = Callable[[str], Path]
@@ -85,6 +86,14 @@ def test_a_psf_of_another_program_is_named_after_its_file(tmp_path: Path) -> Non
         psf = read_psf(save(tmp_path / f"{shape}" / "other_psf.v2.fits", kernel), LIMITS)
         assert (psf.name, psf.status) == ("other_psf", "user")
         assert (psf.instrument, psf.plate_scale_arcsec) == (None, None)
+
+
+def test_a_damaged_size_does_not_let_astropy_read_without_an_end(tmp_path: Path) -> None:
+    """The declared data of this PSF end before the next header, and the bytes there are no header."""
+    (tmp_path / "damaged.fits").write_bytes(plain_image(17066))
+    with pytest.raises(DataError, match="psf-sum"):
+        read_psf(tmp_path / "damaged.fits", LIMITS)
+    assert stated_id(tmp_path / "damaged.fits", LIMITS) is None
 
 
 def test_a_real_psf_of_another_program(real: Find) -> None:
