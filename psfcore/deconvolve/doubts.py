@@ -1,9 +1,9 @@
 """Warnings about the inputs of a deconvolution: the PSF, its channel and mesh, and pixels that are not what they should be.
 
-Three signs of wrong pixels are looked for: spikes, a bias that was not subtracted, and values that were scaled for display. A
-spike (a cosmic ray, a hot pixel) is brighter than the PSF allows. The PSF puts the share k of a point's light into the brightest of the four nearest pixels; a pixel with the
-excess e over its surroundings is a spike if its neighbours have less than half of the excess that its light alone must give
-them:
+Three signs of wrong pixels are looked for: spikes, a bias that was not subtracted, and values that were scaled for display.
+A spike (a cosmic ray, a hot pixel) is brighter than the PSF allows. The PSF puts the share k of a point's light into the
+brightest of the four nearest pixels; a pixel with the excess e over its surroundings is a spike if its neighbours have less
+than half of the excess that its light alone must give them:
 
     excess of the brightest neighbour < k e / 2,   e > SPIKE_SIGMA sigma        Eq. (1)
 

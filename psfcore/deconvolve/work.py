@@ -19,13 +19,13 @@ The difference between the box alone and the same box of the whole image is esti
 
     bound = A max over the box of E        Eq. (3)
 
-If both deconvolutions had converged, the difference would be the error of E alone, which is much smaller. But both
-stop before they converge. E is part of the model image of the whole image: after few steps the whole image still contains a part of it,
-and it slows down the convergence of the pixels that it covers. The subtraction removes both effects. A = AMPLIFICATION
-is the amplification of a slowly varying error by a deconvolution: it is below 2, because more than half of the light of
-a PSF falls within the width of the rim. Eq. (3) is not proved; the tests compare it with the
-differences for the default number of steps of all methods, and docs/speed.md has a table of them: they are at least 5 times smaller. With fewer
-steps than the default, the difference near bright pixels may be larger than the bound.
+If both deconvolutions had converged, the difference would be the error of E alone, which is much smaller. But both stop
+before they converge. E is part of the model image of the whole image: after few steps the whole image still contains a
+part of it, and it slows down the convergence of the pixels that it covers. The subtraction removes both effects. A =
+AMPLIFICATION is the amplification of a slowly varying error by a deconvolution: it is below 2, because more than half
+of the light of a PSF falls within the width of the rim. Eq. (3) is not proved; the tests compare it with the
+differences for the default number of steps of all methods, and docs/speed.md has a table of them: they are at least 5
+times smaller. With fewer steps than the default, the difference near bright pixels may be larger than the bound.
 
 | symbol | name | unit |
 |---|---|---|

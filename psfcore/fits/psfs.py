@@ -6,6 +6,8 @@ In memory, weights are float64 [y, x]. Files that this module writes hold float3
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -179,7 +181,7 @@ def stated_id(path: str | Path, limits: FitsLimits) -> str | None:
     """
     count = len(all_hdus(path, limits))
     try:
-        with fits.open(path, memmap=False, disable_image_compression=True) as hdus:
+        with _first_hdus(path, count) as hdus:
             lines = [str(line) for line in hdus[0].header.get("HISTORY", [])]
             stated = [match[1] for line in lines if (match := _STATED.fullmatch(line))]
             # `read_psf` keeps the HISTORY of a file under this name, and `write_psf` writes it into files derived from
@@ -187,7 +189,7 @@ def stated_id(path: str | Path, limits: FitsLimits) -> str | None:
             derived = any(line.startswith("history:") for line in lines)
             if len(stated) != 1 or derived:
                 return None
-            same = all(as_written(hdus[number]) for number in range(count))
+            same = all(map(as_written, hdus))
     except PIXEL_TROUBLE:  # a damaged file, or one of other software; the job that uses it raises the error
         return None
     return stated[0] if same else None
@@ -201,13 +203,12 @@ def _read_extras(
     components: dict[str, NDArray[np.float64]] = {}
     provenance: dict[str, Any] = {}
     # Any file can have a card PSFNAME. Therefore the size limits are checked for all HDUs. HDUs that write_psf never
-    # writes are ignored: compressed components, and components of another shape. Only the HDUs that were counted are
-    # read: if a damaged size ends the file earlier, astropy takes what follows for a header, and may read on without an end.
+    # writes are ignored: compressed components, and components of another shape.
     count = len(all_hdus(path, limits))
     try:
-        with fits.open(path, memmap=False, disable_image_compression=True) as hdus:
+        with _first_hdus(path, count) as hdus:
             provenance["history"] = [str(line) for line in hdus[0].header.get("HISTORY", [])]
-            for hdu in (hdus[number] for number in range(1, count)):
+            for hdu in hdus[1:]:
                 if isinstance(hdu, fits.ImageHDU) and hdu.shape == shape:
                     components[hdu.name] = np.array(hdu.data, dtype=np.float64)
                 elif not isinstance(hdu, fits.BinTableHDU) or _has_heap(hdu):
@@ -222,6 +223,16 @@ def _read_extras(
         message = f"{expected}; got: {error!s:.120}: copy or make the file again"
         raise DataError("unreadable-pixels", message) from None
     return components, provenance, fitted
+
+
+@contextmanager
+def _first_hdus(path: str | Path, count: int) -> Iterator[list[Any]]:
+    """The first HDUs of a file. count: as many as `all_hdus` finds.
+
+    If a damaged size ends an HDU too early, astropy takes what follows for a header, and may read on without an end.
+    """
+    with fits.open(path, memmap=False, disable_image_compression=True) as hdus:
+        yield [hdus[number] for number in range(count)]
 
 
 def _has_heap(table: fits.BinTableHDU) -> bool:
