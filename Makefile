@@ -28,7 +28,7 @@ demo: $(RUN)
 
 # Without the rules of the house, which make lint checks.
 test: $(DEV) $(if $(CI),browser)
-	$(BIN)/python -m pytest -m "not slow" -n 4 --dist loadfile --ignore tests/house tests
+	$(BIN)/python -m pytest -m "not slow" -n 3 --dist loadfile --ignore tests/house tests
 
 # The tests of one room in one process, for example: make test-fast FILES=tests/psfcore/gap/library
 test-fast: $(DEV)
