@@ -42,8 +42,8 @@ function lead() {
     const open = () => {
       const source = new EventSource("/v1/events");
       source.onopen = () => {
-        // Events may have been missed in the meantime, so the pages read again what they show.
-        if (waiting !== null) tell({ name: "found", data: {} });
+        // Events may have been missed before the stream began, so the pages read again what they show.
+        tell({ name: "found", data: {} });
         clearTimeout(waiting);
         waiting = null;
       };
@@ -74,19 +74,30 @@ function keep({ kind, thing, address, isOpen, ended, show, forget }) {
   const places = new Map([...document.querySelectorAll(`[data-${kind}]`)].map((place) => [place.dataset[kind], place]));
   const phase = (place) => place.querySelector('[data-part="phase"]').textContent;
   const open = () => [...places].filter(([, place]) => isOpen(phase(place)));
+  // An answer can arrive after a later event. Each event and request has a number, and only later numbers are shown.
+  let number = 0;
+  const shown = new Map();
+
+  function showNewer(id, view, its) {
+    if (!places.has(id) || its < (shown.get(id) ?? 0)) return;
+    shown.set(id, its);
+    show(places.get(id), view);
+  }
 
   function drop(id) {
+    if (!forget || !places.has(id)) return;
     forget(places.get(id));
     places.delete(id);
   }
 
   /** Read again the things whose events this page may have missed. */
   async function look() {
-    for (const [id, place] of open()) {
+    for (const [id] of open()) {
       try {
-        show(place, await json(`${address}/${id}`));
+        const its = ++number;
+        showNewer(id, await json(`${address}/${id}`), its);
       } catch (error) {
-        if (error.status === 404 && forget) drop(id);
+        if (error.status === 404) drop(id);
         else if (error instanceof TypeError) return; // the stream tells when the service answers again
         else throw error;
       }
@@ -96,8 +107,8 @@ function keep({ kind, thing, address, isOpen, ended, show, forget }) {
   for (const form of document.querySelectorAll(`#${kind} form`)) whileThere(form, lost);
   if (places.size === 0 || (!ended && open().length === 0)) return;
   listen(({ name, data }) => {
-    if (name === kind && places.has(data.id)) show(places.get(data.id), data);
-    if (name === "gone" && data.kind === kind && forget && places.has(data.id)) drop(data.id);
+    if (name === kind) showNewer(data.id, data, ++number);
+    if (name === "gone" && data.kind === kind) drop(data.id);
     if (lost !== null && name === "lost") {
       lost.hidden = false;
       lost.textContent = `The service does not answer. When it is back, the ${thing} continues and this page updates itself.`;

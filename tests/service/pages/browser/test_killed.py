@@ -50,7 +50,7 @@ def test_the_page_continues_after_the_service_was_killed(
     page: Page, watch: Watch, site: Site, stack: Stack, submit: Submit
 ) -> None:
     watch.allowed += ["ERR_CONNECTION_REFUSED", "ERR_INCOMPLETE_CHUNKED_ENCODING", "ERR_CONNECTION_RESET"]
-    job = submit("large", 150)
+    job = submit("large", 150, **LONG)
     page.goto(f"/jobs/{job['id']}")
     page.evaluate(MARK)
     expect(page.locator("#job [data-part=progress]")).to_contain_text("of 150", timeout=LONG_MS)

@@ -9,7 +9,7 @@ from urllib.parse import urlsplit
 
 import pytest
 from astropy.io import fits
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import APIResponse, Browser, Page, Route, expect
 from sqlalchemy import create_engine, delete
 
 from tests.conftest import write_image
@@ -139,6 +139,22 @@ def test_a_job_is_followed_to_its_product_without_a_reload(page: Page, submit: S
     assert listed.evaluate(NOT_RELOADED)
     page.go_back()
     expect(page).to_have_url("about:blank")  # and not the job's page, which would lead on at once
+
+
+def test_an_answer_later_than_a_newer_event_is_not_shown(page: Page, site: Site, submit: Submit) -> None:
+    job = submit("large", 139)
+    held: list[tuple[Route, APIResponse]] = []
+    page.route(f"**/v1/jobs/{job['id']}", lambda route: held.append((route, route.fetch())))
+    page.goto(f"/jobs/{job['id']}")
+    phase = page.locator("[data-part=phase]")
+    expect(phase).to_have_text("EXECUTING", timeout=LONG_MS)
+    site.client.cancel(job["id"])
+    expect(phase).to_have_text("ABORTED", timeout=LONG_MS)
+    assert held[0][1].json()["phase"] in ("QUEUED", "EXECUTING")
+    for route, answer in held:
+        with page.expect_event("requestfinished", lambda request: request == route.request):  # noqa: B023
+            route.fulfill(response=answer)
+    expect(phase).to_have_text("ABORTED")
 
 
 def test_a_failed_job_says_why_and_what_to_do(
