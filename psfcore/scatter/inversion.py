@@ -58,7 +58,7 @@ from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Shape, Vector
 from psfcore.scatter.total_psf import Blur, Kernel, Optics, TotalPsf, noise_covariance
 from psfcore.transit.transit import Transit
 
-ALGORITHM_VERSION = 1  # of `invert`: a change of its results needs a new number, because solutions are kept
+ALGORITHM_VERSION = 2  # of `invert`: a change of its results needs a new number, because solutions are kept
 PILOT_FRAMES = 16
 PILOT_CONVERGED_POINTS = 0.3
 CONVERGED_POINTS = 0.02  # limit for the change of C(R), in percentage points: a tenth of the allowed bias

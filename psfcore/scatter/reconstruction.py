@@ -100,9 +100,16 @@ class TransitScenes:
         return cls(transit, scenes)
 
     def improve(self, n: int, optics: Optics, steps: int) -> None:
-        """Step (d) again: continue from the scene of image n for some steps."""
+        """Step (d) again: continue from the scene of image n for some steps.
+
+        If the PSF has little power at some frequencies, each step restores more of them and amplifies their noise more. Then
+        the reconstruction begins again, so that the scene does not depend on the number of rounds.
+        """
         observed = optics.lanes(self.transit.frames[n].pixels)
-        self.scenes[n] = optics.invert(observed, self.scenes[n], steps=steps)
+        if optics.invertible:
+            self.scenes[n] = optics.invert(observed, self.scenes[n], steps=steps)
+        else:
+            self.scenes[n] = optics.invert(observed)
 
     def copy(self) -> TransitScenes:
         """A second object with the same contents. Arrays are shared, because no code writes to them."""

@@ -19,6 +19,7 @@ from psfcore.scatter import fit as fit_module
 from psfcore.scatter.as_published import AS_PUBLISHED, CORRECTED_ALONE, Choices, Published
 from psfcore.scatter.fit import (
     ALONE_SUBSETS,
+    BIAS_OF_BROAD_CORES_POINTS,
     RADII_PX,
     TransitFit,
     fit_json,
@@ -27,16 +28,23 @@ from psfcore.scatter.fit import (
     fitted_psf,
     overdispersion,
 )
+from psfcore.scatter.inversion import invert
 from psfcore.scatter.plots import fit_png
 from psfcore.scatter.reconstruction import Inversion, Solution
 from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW
+from psfcore.simulate.plan import default_plan
+from psfcore.simulate.sky import true_sky
 from psfcore.transit.transit import Transit
-from tests.psfcore.conftest import LIMITS
+from tests.psfcore.conftest import LIMITS, gaussian
 from tests.psfcore.small_transits import (
+    BRIGHTNESS,
     DIFFRACTION,
     IMAGES,
+    SCATTER,
+    SIZE_PX,
     fitted,
     fitted_with_progress,
+    observed,
     recipe,
     sky,
     solved,
@@ -124,6 +132,18 @@ def test_an_effect_that_the_model_lacks_enlarges_all_errors(
         "did not converge in 1 image",
     ):
         assert part in words
+
+
+def test_a_fit_with_a_broad_diffraction_psf_is_near_the_truth_and_says_its_bias(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert "finest structures" not in "; ".join(fitted().limits)
+    plan = default_plan(IMAGES, SIZE_PX, oversampling=1, brightness=BRIGHTNESS)
+    of = true_sky(plan, SCATTER, gaussian(31, 1.0), 3)
+    fit = fit_of(monkeypatch, invert(observed(of).transit))
+    assert fit.inversion.converged
+    assert abs(100 * (fit.inversion.values["total"] - SCATTER.total)) < BIAS_OF_BROAD_CORES_POINTS
+    assert "do not contain the finest structures" in "; ".join(fit.limits)
 
 
 def test_free_shells_agree_with_the_truth_within_the_field() -> None:
