@@ -25,6 +25,7 @@ from service.vo import job_documents as documents
 from service.vo.job_forms import SentForm, check, files_of, ids_of, keep, kind_of, resolved
 from service.vo.parameters import (
     NO_XML,
+    PLAIN_ERRORS,
     Form,
     PlainErrors,
     bad,
@@ -75,12 +76,7 @@ router = APIRouter(
     prefix="/uws/jobs",
     tags=["uws"],
     route_class=PlainErrors,
-    responses={
-        "4XX": {
-            "content": {"text/plain": {}},
-            "description": "What was expected, what was received, and what to do next.",
-        }
-    },
+    responses=PLAIN_ERRORS,
 )
 
 

@@ -28,7 +28,17 @@ from service.http.problems import Problem, as_problems
 from service.http.quotas import check_disk
 from service.http.state import Shared, State
 from service.vo.lists import LINKS_STANDARD, LINKS_TYPE, PSF, VOTABLE_ERROR, VotableErrors, did, row_named
-from service.vo.parameters import VOTABLE, Fields, PlainErrors, base_url, format_of, one, query, refuse
+from service.vo.parameters import (
+    PLAIN_ERRORS,
+    VOTABLE,
+    Fields,
+    PlainErrors,
+    base_url,
+    format_of,
+    one,
+    query,
+    refuse,
+)
 from service.vo.votables import LINKS, Input, Service, table_document
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow
 
@@ -203,7 +213,7 @@ def _fault(name: str | None, message: str, semantics: str = "#this", local: str 
             "content": {files.FITS_TYPE: {"schema": {"type": "string", "format": "binary"}}},
             "description": "A FITS file with the image and its planes",
         },
-        "4XX": {"content": {"text/plain": {}}, "description": "What was expected, what was received, and what to do."},
+        **PLAIN_ERRORS,
     },
     openapi_extra=query(
         ID="id of a product, or its name urn:heliopsf:product:...",

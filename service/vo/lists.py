@@ -62,7 +62,10 @@ class VotableErrors(PlainErrors):
 
 
 VOTABLE_ERROR: dict[int | str, dict[str, Any]] = {
-    "4XX": {"content": {VOTABLE_TYPE: {}}, "description": "A VOTable with QUERY_STATUS=ERROR"}
+    "4XX": {
+        "content": {VOTABLE_TYPE: {}, "application/problem+json": {}},
+        "description": "A VOTable with QUERY_STATUS=ERROR; problem details if the service is not called by this host name",
+    }
 }
 LIST: dict[str, Any] = {
     "response_class": Response,

@@ -169,6 +169,16 @@ def format_of(fields: Mapping[str, list[str]], *allowed: str) -> str:
 # Answers --------------------------------------------------------------------------------------------
 
 
+# OpenAPI description of the errors of routes of the class PlainErrors.
+PLAIN_ERRORS: dict[str | int, dict[str, Any]] = {
+    "4XX": {
+        "content": {"text/plain": {}, "application/problem+json": {}},
+        "description": "What was expected, what was received, and what to do next; as problem details if the request is not "
+        "permitted from its origin or under this host name.",
+    }
+}
+
+
 class PlainErrors(APIRoute):
     """Errors as plain text, which clients of the Virtual Observatory show to their users."""
 
