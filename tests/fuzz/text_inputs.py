@@ -82,7 +82,7 @@ def instrument(seed: int) -> bytes:
                     rng.choice([1, 2, 17, 65], p=[0.7, 0.2, 0.05, 0.05])
                 )
             case _:
-                number = rng.choice(list(re.finditer(r"(?<== )-?\d[\d.e-]*|(?<=\[)\d+(?=,)", text)))
+                number = rng.choice(list(re.finditer(r"(?<== )-?\d[\d.e+-]*|(?<=\[)\d+(?=,)", text)))
                 usual = f"{float(number[0]) * 2 ** rng.uniform(-2, 2):.6g}"
                 value = str(rng.choice(NUMBERS)) if rng.random() < 0.3 else usual
                 text = text[: number.start()] + value + text[number.end() :]
