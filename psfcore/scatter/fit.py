@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 
 from psfcore.arrays import json_attributes
 from psfcore.convolution.convolver import Convolver
+from psfcore.deconvolve.methods.linear import LEAST_TRANSFER
 from psfcore.psf import (
     CURVE_RADII_PX,
     REACH_GRID_PX,
@@ -65,7 +66,7 @@ RADII_PX = (*CURVE_RADII_PX, 500.0, 1000.0)
 # A recipe with one corrected bias uses the same subsets as the published recipe, so few subsets show the difference.
 ALONE_SUBSETS = 30
 WORST_CHI2 = 1.5  # largest acceptable chi2 per pixel; with 10,000 pixels, its standard error is 0.014
-# The largest error in 8 simulated transits of 18 images of 128 px, with Gaussian cores of sigma 0.8 or 1.2 px.
+# The largest error in 16 simulated transits of 18 images of 128 px, with Gaussian cores of sigma 0.62 to 1.2 px.
 BIAS_OF_BROAD_CORES_POINTS = 4.4
 OPEN_POINTS = 3.0  # percentage points; a larger error of the curve is reported as a limit
 SCHEMA = "psf-fit/1"
@@ -332,7 +333,7 @@ def _limits(solution: Solution, curve: Curve, factor: float) -> tuple[str, ...]:
             f"the model does not describe the occulted pixels: chi2 per pixel is {inversion.chi2_per_pixel:.2f}, "
             "expected 1; check the noise figures, and the positions and radii of the discs in transit.json"
         )
-    if not solution.optics.invertible:
+    if solution.optics.least_transfer < LEAST_TRANSFER:
         out.append(
             "the diffraction PSF blurs so much that the images do not contain the finest structures: in simulations with such "
             f"PSFs, the fraction of scattered light was wrong by up to {BIAS_OF_BROAD_CORES_POINTS:g} percentage points"

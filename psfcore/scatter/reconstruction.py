@@ -32,6 +32,8 @@ LEAST_DARK_PIXELS = 30
 # The variance of a pixel is computed from its expected intensity, but at least from this fraction of the disc's mean.
 LEAST_LEVEL = 0.2
 SCENES_KEPT = 13
+# If the PSF has at least this power at all frequencies, scenes that are continued settle within the rounds of a fit.
+SETTLING_TRANSFER = 0.05
 
 
 def labelled(progress: Progress, label: str) -> Progress:
@@ -106,7 +108,7 @@ class TransitScenes:
         the reconstruction begins again, so that the scene does not depend on the number of rounds.
         """
         observed = optics.lanes(self.transit.frames[n].pixels)
-        if optics.invertible:
+        if optics.least_transfer >= SETTLING_TRANSFER:
             self.scenes[n] = optics.invert(observed, self.scenes[n], steps=steps)
         else:
             self.scenes[n] = optics.invert(observed)

@@ -52,7 +52,7 @@ from psfcore.convolution.convolver import Convolver
 from psfcore.convolution.engine import BLOCK_ROWS, Engine
 from psfcore.convolution.fft_kernels import LANES
 from psfcore.deconvolve.assess.error_planes import sigma_points
-from psfcore.deconvolve.methods.linear import LEAST_TRANSFER, inverse_filter, solve_linear, transfer_sample
+from psfcore.deconvolve.methods.linear import inverse_filter, solve_linear, transfer_sample
 from psfcore.errors import DataError
 from psfcore.noise import Noise
 from psfcore.psf import CURVE_RADII_PX, REACH_GRID_PX, FittedShape, Psf, encircled_energy
@@ -209,7 +209,8 @@ class Blur:
 class Optics(Blur):
     """Convolution with a PSF, and its approximate inverse.
 
-    invertible: whether the PSF has enough power at all frequencies for Eq. (1) to converge within a few steps.
+    least_transfer: the smallest absolute value of the PSF's Fourier transform. Eq. (1) converges at once where it is at least
+    LEAST_TRANSFER of `psfcore.deconvolve.methods.linear`, and slowly where it is smaller.
     """
 
     def __init__(
@@ -217,7 +218,7 @@ class Optics(Blur):
     ) -> None:
         super().__init__(psf_kernel, field_shape, threads=threads)
         self._inverse = inverse_filter(self.engine)
-        self.invertible = bool(np.abs(transfer_sample(self.engine).values).min() >= LEAST_TRANSFER)
+        self.least_transfer = float(np.abs(transfer_sample(self.engine).values).min())
 
     def invert_once(self, lanes: Lanes, *, adjoint: bool = False) -> Lanes:
         """G y, or G^T y if `adjoint`."""
