@@ -2,9 +2,9 @@
 
 DIR/set.json                  the plan of the set: seed, sizes, number of cases
 DIR/cases/NNNN/transit/       the input of the diagnosis of case NNNN
-DIR/cases/NNNN/expected/      images without noise, the input of the ideal observer; the diagnosis does not see them
-DIR/cases/NNNN/report.json    the report of this diagnosis (gap/2)
-DIR/cases/NNNN/ideal.json     what an ideal observer could know (gap-ideal/1)
+DIR/cases/NNNN/expected/      images without noise, the input of the bound; the diagnosis does not see them
+DIR/cases/NNNN/report.json    the report of this diagnosis (gap/3)
+DIR/cases/NNNN/bound.json     what a Bayes observer could know (gap-bound/1)
 DIR/cases/NNNN/run.json       time and memory of the diagnosis, and the reason if it gave no report
 DIR/truth/NNNN.json           salt and truth
 DIR/seals.jsonl               one line for each case: {"case", "sha256"}
@@ -35,7 +35,6 @@ from numpy.typing import NDArray
 from psfcore.arrays import array_sha256
 from psfcore.blind.cases import DRAW, SetPlan, draw_case
 from psfcore.blind.make_case import make
-from psfcore.blind.simulator import simulate_case, simulator_of, source_sha256
 from psfcore.errors import DataError
 from psfcore.files import write_whole
 
@@ -67,9 +66,9 @@ class BlindSet:
         """The folder with the noise-free transits of a case."""
         return self.case_folder(number) / "expected"
 
-    def ideal(self, number: int) -> Path:
-        """The file that states what an ideal observer could know about a case."""
-        return self.case_folder(number) / "ideal.json"
+    def bound(self, number: int) -> Path:
+        """The file that states what a Bayes observer could know about a case."""
+        return self.case_folder(number) / "bound.json"
 
     def truth_file(self, number: int) -> Path:
         """The file with salt and truth of a case."""
@@ -97,8 +96,10 @@ class BlindSet:
                     "set again in another folder",
                 ) from error
             if found.setdefault(number, seal) != seal:
-                message = f"expected one seal per case; got two for case {number:04d}: make the set again in another folder"
-                raise DataError("bad-seals", message)
+                raise DataError(
+                    "bad-seals",
+                    f"expected one seal per case; got two for case {number:04d}: make the set again in another folder",
+                )
         return found
 
     def keep_truth(self, number: int, truth: dict[str, Any]) -> str:
@@ -127,8 +128,8 @@ class BlindSet:
         if seal is None or _seal_of(salt, truth) != seal:
             raise DataError(
                 "broken-seal",
-                f"case {number:04d}: expected a truth with the hash {seal}; this truth was changed after it was sealed, "
-                "or it was never sealed",
+                f"case {number:04d}: expected a truth with the hash {seal}; this truth was changed after it was "
+                "sealed, or it was never sealed",
             )
         return truth
 
@@ -151,19 +152,16 @@ def make_set(
     """Make and seal the missing cases of a set. Two results: the set, and for each case that could not be made, the
     reason.
 
-    scenes: images [y, x] in DN/s, from which scenes are cut. Raises DataError "other-set" if the folder contains a set
-    that was made with another plan, other scenes or another simulator. Also raises "bad-seals", "bad-simulator" and the
-    errors of `draw_case`. All errors are raised before the first case is made.
+    scenes: images [y, x] in DN/s, from which scenes are cut. Raises DataError "other-set" if the folder contains a
+    set that was made with another plan or other scenes, "bad-seals", and the errors of `draw_case`: all before the
+    first case is made.
     """
     made = BlindSet(folder)
     _remember(made, plan, scenes)
     (folder / "truth").mkdir(parents=True, exist_ok=True)
     missing = [number for number in plan.numbers if not made.is_made(number)]
-    if plan.simulator:
-        simulator_of(plan.simulator)
-    else:
-        for number in missing:
-            draw_case(plan, number)
+    for number in missing:
+        draw_case(plan, number)
     not_made: dict[int, str] = {}
     for done, (number, seal, why_not, seconds) in enumerate(
         _attempts(made, plan, missing, scenes, processes), 1
@@ -200,13 +198,9 @@ def _attempts(
 def _attempt(made: BlindSet, plan: SetPlan, number: int, scenes: Sequence[Plane]) -> Attempt:
     started = time.perf_counter()
     shutil.rmtree(made.case_folder(number), ignore_errors=True)  # an interrupted run may have left it
-    folders = made.transit(number), made.expected(number)
     seal, why_not = "", ""
     try:
-        if plan.simulator:
-            truth = simulate_case(plan, number, *folders)
-        else:
-            truth = make(draw_case(plan, number), *folders, scenes)
+        truth = make(draw_case(plan, number), made.transit(number), made.expected(number), scenes)
         seal = made.keep_truth(number, truth)
     except DataError as error:
         why_not = f"{error.code}: {error.message}"
@@ -227,11 +221,7 @@ def _end_with_parent() -> None:
 
 def _remember(made: BlindSet, plan: SetPlan, scenes: Sequence[Plane]) -> None:
     """Write the plan of the set; if the folder contains a set, check that it has the same plan."""
-    own = {
-        "scenes": [array_sha256(scene) for scene in scenes],
-        "draw": DRAW,
-        "simulator": source_sha256(plan.simulator) if plan.simulator else "",
-    }
+    own = {"scenes": [array_sha256(scene) for scene in scenes], "draw": DRAW}
     about = json.loads(json.dumps(asdict(plan) | own))
     file = made.folder / "set.json"
     if file.is_file():
@@ -240,8 +230,8 @@ def _remember(made: BlindSet, plan: SetPlan, scenes: Sequence[Plane]) -> None:
         if same != {key: value for key, value in about.items() if key != "cases"}:
             raise DataError(
                 "other-set",
-                f"expected an empty folder, or a set that was made with {about}; {made.folder} contains a set that was made "
-                f"with {before}. Choose another folder",
+                f"expected an empty folder, or a set that was made with {about}; {made.folder} contains a set that "
+                f"was made with {before}. Choose another folder",
             )
     elif made.folder.is_dir() and (others := {path.name for path in made.folder.iterdir()} - {LOCK}):
         raise DataError(

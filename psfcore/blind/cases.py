@@ -12,12 +12,12 @@ consecutive cases
 - 4 have one withheld effect, in turn as well;
 - 3 are mixed: they have one known and one withheld effect, each in turn.
 
-The target of an effect is the residual that this effect alone should leave in the discs after a refit of the PSF. It is
-drawn log-uniformly from USUAL_PCT, for a strong effect from STRONG_PCT, and for both effects of a mixed case from
+The target of an effect is the residual that this effect alone should leave in the discs after a refit of the PSF. It
+is drawn log-uniformly from USUAL_PCT, for a strong effect from STRONG_PCT, and for both effects of a mixed case from
 MIXED_PCT. In every fourth case with one known effect, this effect is strong. A withheld effect of the tests gets the
-three ranges of TEST_PCT in turn. If the largest plausible strength of an effect leaves less than the target, the effect
-gets this strength. A changing Sun beside a strong effect has no target, because the discs hardly show the changes of the
-Sun. The relative rms of these changes is drawn log-uniformly from SUN_RMS.
+three ranges of TEST_PCT in turn. If the largest plausible strength of an effect leaves less than the target, the
+effect gets this strength. A changing Sun beside a strong effect has no target, because the discs hardly show the
+changes of the Sun. The relative rms of these changes is drawn log-uniformly from SUN_RMS.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from psfcore.simulate.scene import drawn_scene, scene_from_image
 Plane = NDArray[np.float64]
 Range = tuple[float, float]
 CLEAN, SINGLE, PAIR, FOREIGN, MIXED = "clean", "single", "pair", "unknown", "mixed"
-DRAW = 3  # raise it when the same seed and number give another case
+DRAW = 4  # raise it when the same seed and number give another case
 _BLOCK = (CLEAN,) * 6 + (SINGLE,) * 8 + (PAIR,) * 3 + (FOREIGN,) * 4 + (MIXED,) * 3
 USUAL_PCT, STRONG_PCT, MIXED_PCT = (0.5, 10.0), (10.0, 30.0), (3.0, 15.0)
 TEST_PCT = ((0.8, 1.25), (2.4, 3.75), (8.0, 12.5))
@@ -64,12 +64,11 @@ class SetPlan:
     """The plan of a set.
 
     cases: number of cases. size_px, images: of each transit. first: the number of the first case. only: names of
-    effects; every case has one of them, in turn. clean_only: no case has an effect. built_diffraction: True: half of the
-    cases have the diffraction PSF of the instrument, and half a synthetic one. False: all have a synthetic one.
+    effects; every case has one of them, in turn. clean_only: no case has an effect. built_diffraction: True: half of
+    the cases have the diffraction PSF of the instrument, and half a synthetic one. False: all have a synthetic one.
     left_pct: the residuals (percent) that an effect should leave in the discs after a refit. The values are used in
     turn, each for all names of `only`. Empty: the residuals are drawn at random; for the names of `only` from
-    USUAL_PCT. simulator: the file or module of a user's simulator, which makes the cases of the set
-    (`psfcore.blind.simulator`); empty: cases are drawn. withheld: the group of withheld effects, a key of WITHHELD.
+    USUAL_PCT. withheld: the group of withheld effects, a key of WITHHELD.
     """
 
     cases: int
@@ -81,7 +80,6 @@ class SetPlan:
     clean_only: bool = False
     built_diffraction: bool = True
     left_pct: tuple[float, ...] = ()
-    simulator: str = ""
     withheld: str = TEST
 
     @property
@@ -94,10 +92,10 @@ class SetPlan:
 class Case:
     """One case before it is made.
 
-    kind: CLEAN, SINGLE, PAIR, FOREIGN or MIXED. law, glass: the true scatter and the known part of the PSF. effects: the
-    effects, at their nominal strengths. target_pct: the residual that each effect alone should leave in the discs after
-    a refit, percent; None: the strength of the effect is already set. headroom: the saturation level divided by the
-    value of the brightest pixel; None: no pixel saturates.
+    kind: CLEAN, SINGLE, PAIR, FOREIGN or MIXED. law, glass: the true scatter and the known part of the PSF. effects:
+    the effects, at their nominal strengths. target_pct: the residual that each effect alone should leave in the discs
+    after a refit, percent; None: the strength of the effect is already set. headroom: the saturation level divided by
+    the value of the brightest pixel; None: no pixel saturates.
     """
 
     number: int
@@ -120,16 +118,13 @@ def draw_case(of: SetPlan, number: int) -> Case:
     glass = _glass(of.size_px, rng, of.built_diffraction)
     headroom = float(rng.uniform(1.2, 2.0)) if rng.random() < _SATURATING_SHARE else None
     own = np.random.default_rng([of.seed, number, _EFFECT_STREAM])
-    effects = [effect_named(name).drawn(plan, own) for name, _ in content]
-    targets: list[float | None] = []
-    for n, (_, (low, high)) in enumerate(content):
-        value = float(np.exp(own.uniform(np.log(low), np.log(high))))
-        if (low, high) == SUN_RMS:
-            effects[n] = effects[n].at(value)
-            targets.append(None)
-        else:
-            turn = number // max(len(of.only), 1)
-            targets.append(of.left_pct[turn % len(of.left_pct)] if of.left_pct else value)
+    turn = number // max(len(of.only), 1)
+    given = of.left_pct[turn % len(of.left_pct)] if of.left_pct else None
+    effects, targets = list[Effect](), list[float | None]()
+    for name, ends in content:
+        effect, value = effect_named(name).drawn(plan, own), float(np.exp(own.uniform(*np.log(ends))))
+        effects.append(effect.at(value) if ends == SUN_RMS else effect)
+        targets.append(None if ends == SUN_RMS else given or value)
     own_seed = int(own.integers(2**31))
     return Case(number, own_seed, kind, plan, law, glass, tuple(effects), tuple(targets), headroom)
 
@@ -159,8 +154,8 @@ def _content(of: SetPlan, number: int) -> tuple[str, list[tuple[str, Range]]]:
         step = withheld.index(name) + count // len(withheld)
         return kind, [(name, TEST_PCT[step % len(TEST_PCT)] if of.withheld == TEST else USUAL_PCT)]
     if kind == MIXED:
-        names = _in_turn(of.seed, count, _IN_DISCS, 3), _in_turn(of.seed, count, withheld, 4)
-        return kind, [(name, MIXED_PCT) for name in names]
+        groups = ((_IN_DISCS, 3), (withheld, 4))
+        return kind, [(_in_turn(of.seed, count, names, stream), MIXED_PCT) for names, stream in groups]
     return kind, _pair(of.seed, count) if kind == PAIR else []
 
 
@@ -178,7 +173,8 @@ def _pair(seed: int, count: int) -> list[tuple[str, Range]]:
 
 
 def _in_turn(seed: int, count: int, names: Sequence[str], stream: int) -> str:
-    """Entry `count` of an endless list of the names. The order is random, but every name occurs once before any is repeated."""
+    """Entry `count` of an endless list of the names. The order is random, but every name occurs once before any is
+    repeated."""
     turn, place = divmod(count, len(names))
     order = np.random.default_rng([seed, turn, _KIND_STREAM, 3 + stream]).permutation(len(names))
     return names[order[place]]
@@ -199,16 +195,13 @@ def _plan(size_px: int, images: int, rng: np.random.Generator) -> Plan:
     upside_down = bool(rng.random() < 0.5)
     moves = rng.uniform(-0.06, 0.06, (len(plan.views), 2)) * size_px
     low = plan.radius_px + 6
-    shots = []
-    for shot in plan.shots:
-        x, y = np.clip(
-            (shot.x_px + moves[shot.pointing - 1, 0], shot.y_px + moves[shot.pointing - 1, 1]),
-            low,
-            size_px - 1 - low,
-        )
-        y = size_px - 1 - y if upside_down else y
-        shots.append(Shot(shot.pointing, float(x), float(y), shot.exposure_s, shot.gain_mode, shot.time_s))
-    return dataclasses.replace(plan, shots=tuple(shots))
+
+    def moved(shot: Shot) -> Shot:
+        at = np.array((shot.x_px, shot.y_px)) + moves[shot.pointing - 1]
+        x, y = np.clip(at, low, size_px - 1 - low).tolist()
+        return dataclasses.replace(shot, x_px=x, y_px=size_px - 1 - y if upside_down else y)
+
+    return dataclasses.replace(plan, shots=tuple(map(moved, plan.shots)))
 
 
 def _glass(size_px: int, rng: np.random.Generator, built: bool) -> Glass:
@@ -225,7 +218,8 @@ def _glass(size_px: int, rng: np.random.Generator, built: bool) -> Glass:
 
 
 def case_scenes(case: Case, images: Sequence[Plane] = ()) -> dict[int, Plane]:
-    """Fine scenes [y, x], DN/s, by pointing: cut from images, or synthetic with random statistics if there are no images.
+    """Fine scenes [y, x], DN/s, by pointing: cut from images, or synthetic with random statistics if there are no
+    images.
 
     images: [y, x] in DN/s, used in turn. A single image is mirrored for the west limb. Raises DataError "bad-scene".
     """
@@ -242,14 +236,16 @@ def case_scenes(case: Case, images: Sequence[Plane] = ()) -> dict[int, Plane]:
         if scene.max() <= 0:
             raise DataError(
                 "bad-scene",
-                f"expected light in the scene of pointing {pointing}; all pixels of this scene are 0: choose another image",
+                f"expected light in the scene of pointing {pointing}; all pixels of this scene are 0: "
+                "choose another image",
             )
         scenes[pointing] = scene
     return scenes
 
 
 def _with_own_statistics(scene: Plane, case: Case, pointing: int) -> Plane:
-    """Add to a synthetic scene: broad and fine modulation, compact brightenings with power-law brightness, and a constant."""
+    """Add to a synthetic scene: broad and fine modulation, compact brightenings with power-law brightness, and a
+    constant."""
     rng = np.random.default_rng([case.seed, pointing, 4])
     n = scene.shape[0]
     seed = int(rng.integers(2**31))

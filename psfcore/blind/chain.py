@@ -1,16 +1,17 @@
 """Simulate exposures from scenes, on fine pixels, with any effects at each step.
 
-    fine light = spread(P (S - h))  ->  light()  ->  binned  ->  expected()  ->  photons, read noise  ->  read_out()  ->  whole DN
+    fine light = spread(P (S - h))  ->  light()  ->  binned  ->  expected()  ->  photons, read noise  ->  read_out()
+    ->  whole DN
 
-S is the scene, h is the part of S that the occulter hides, and P is the convolution with the PSF. "binned" averages the fine
-pixels of each detector pixel; the other names are steps of `effects.effect.STAGES`. Because P is linear, the scene of a
-pointing is convolved only once. For each image, only the difference between its scene with the occulter (S - h) and the
-scene of its pointing is convolved.
+S is the scene, h is the part of S that the occulter hides, and P is the convolution with the PSF. "binned" averages
+the fine pixels of each detector pixel; the other names are steps of `effects.effect`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,123 +28,118 @@ _MOST_MOTION_PX = 5.0  # largest distance of a moving disc from its position in 
 _REALISATIONS_STREAM, _NOISE_STREAM = 2001, 2002
 
 
+@dataclass(frozen=True, eq=False)
 class EffectFree:
-    """The images of a plan without any effect, on fine pixels. Each result is computed once and kept.
+    """A plan, its telescope and its scenes without any effect.
 
     scenes: fine scenes [y, x], DN/s, by pointing. Along each axis, FINE fine pixels cover one detector pixel.
     """
 
-    def __init__(self, plan: Plan, optics: FineOptics, scenes: Mapping[int, Plane]) -> None:
-        self.plan, self.optics, self.scenes = plan, optics, scenes
-        self._light: dict[int, NDArray[np.float32]] = {}
-        self._seen: dict[int, Plane] = {}
+    plan: Plan
+    optics: FineOptics
+    scenes: Mapping[int, Plane]
 
-    def light(self, index: int) -> Plane:
-        """The light of an image in the focal plane, on fine pixels [y, x], DN/s."""
-        if index not in self._light:
-            moment = Moment(self.plan, index)
-            light = self.seen(lit_scene(self, (), moment), moment, self.optics, self._seen)
-            self._light[index] = light.astype(np.float32)
-        return self._light[index].astype(np.float64)
-
-    def seen(self, lit: Plane, moment: Moment, optics: FineOptics, kept: dict[int, Plane]) -> Plane:
-        """A fine scene through a telescope, [y, x], DN/s.
-
-        kept: the scene of each pointing through the same telescope, without an occulter; missing scenes are added.
-        """
-        pointing = moment.shot.pointing
-        scene = self.scenes[pointing]
-        if pointing not in kept:
-            kept[pointing] = np.asarray(optics.through.apply(scene), dtype=np.float64)
-        return np.asarray(kept[pointing] + optics.through.apply(lit - scene))
+    @cached_property
+    def lights(self) -> list[NDArray[np.float32]]:
+        """The light of every image in the focal plane, on fine pixels [y, x], DN/s; computed once for many chains."""
+        return [light.astype(np.float32) for light in focal_planes(self, ())]
 
 
 class Chain:
-    """The simulation of the images of a plan with a set of effects.
+    """The simulation of the images of a plan with a set of effects. Each result is computed once and kept.
 
-    level: the level (DN) at which high-only images clip if no effect sets it; None: no clipping.
+    seed: the seed of the noise. headroom: the level at which high-only images clip, divided by the brightest pixel,
+    if no effect sets this level; None: no clipping.
     """
 
-    def __init__(self, clean: EffectFree, effects: Sequence[Effect], level: float | None = None) -> None:
-        self.clean, self.plan, self.effects, self.level = clean, clean.plan, tuple(effects), level
-        self._changes_sky = any(e.strength and e.kind.step in _SKY_STEPS for e in self.effects)
-        self._varies = any(effect.kind.varies for effect in self.effects)
-        self._optics: FineOptics | None = None
-        self._seen: dict[int, Plane] = {}
+    def __init__(
+        self, clean: EffectFree, effects: Sequence[Effect], seed: int, headroom: float | None = None
+    ) -> None:
+        self.clean, self.plan, self.effects, self.seed = clean, clean.plan, tuple(effects), seed
+        self.headroom = headroom
 
-    def expected(self, index: int) -> Plane:
-        """The expected light on detector pixels [y, x], DN/s, before the readout. It contains no noise."""
-        moment = Moment(self.plan, index)
-        light = self._focal_plane(moment) if self._changes_sky else self.clean.light(index)
-        light = apply_effects(self.effects, "light", light, moment)
-        rate = apply_effects(self.effects, "expected", binned(np.maximum(light, 0.0), FINE), moment)
-        return np.maximum(rate, 0.0)
+    def with_effects(self, *effects: Effect) -> Chain:
+        """The same simulation with other effects."""
+        return Chain(self.clean, effects, self.seed, self.headroom)
 
-    def _focal_plane(self, moment: Moment) -> Plane:
-        if self._optics is None or self._varies:
-            self._optics, self._seen = apply_effects(self.effects, "optics", self.clean.optics, moment), {}
-        lit = lit_scene(self.clean, self.effects, moment)
-        seen = self.clean.seen(lit, moment, self._optics, self._seen)
-        return np.asarray(apply_effects(self.effects, "spread", seen, lit, self._optics, moment))
+    @cached_property
+    def rates(self) -> list[Plane]:
+        """The expected light of every image on detector pixels [y, x], DN/s, before the readout. It contains no
+        noise."""
+        changes_sky = any(effect.strength and effect.kind.step in _SKY_STEPS for effect in self.effects)
+        lights: Iterable[NDArray[np.floating]] = self.clean.lights
+        if changes_sky:
+            lights = focal_planes(self.clean, self.effects)
+        rates = []
+        for index, plane in enumerate(lights):
+            moment = Moment(self.plan, index)
+            light = apply_effects(self.effects, "light", plane.astype(np.float64), moment)
+            rate = apply_effects(self.effects, "expected", binned(np.maximum(light, 0.0), FINE), moment)
+            rates.append(np.maximum(rate, 0.0))
+        return rates
 
-    def all_expected(self) -> list[Plane]:
-        """The result of `expected` for every image."""
-        return [self.expected(index) for index in range(len(self.plan.shots))]
-
-    def saturation_dn(self, expected: Sequence[Plane]) -> float | None:
+    @cached_property
+    def level(self) -> float | None:
         """The level (DN) at which high-only images clip; None: no clipping."""
         for effect in self.effects:
             if effect.kind.saturation_dn is not None and effect.strength:
-                return effect.kind.saturation_dn(effect, self._exposures(expected), self.plan)
-        return self.level
+                return effect.kind.saturation_dn(effect, self._exposures, self.plan)
+        return None if self.headroom is None else float(np.rint(self.headroom * np.max(self._exposures)))
 
-    def read_out(self, expected: Sequence[Plane], seed: int) -> list[Plane]:
-        """The exposures in whole DN [y, x], with noise and clipping. seed: the seed of the noise realisation."""
-        noisy = self._through_readout(expected, self._noisy(expected, [seed, _NOISE_STREAM]))
-        return [np.rint(dn) for dn in self._clipped(noisy, expected)]
+    def read_out(self) -> list[Plane]:
+        """The exposures in whole DN [y, x], with noise and clipping."""
+        return [np.rint(dn) for dn in self._clipped(self._through_readout(self._noisy(_NOISE_STREAM)))]
 
-    def mean_rate(self, expected: Sequence[Plane], seed: int) -> list[Plane]:
+    @cached_property
+    def mean(self) -> list[Plane]:
         """Clipped images [y, x], DN/s, that are approximately the mean of many exposures.
 
         If the change by an effect during the readout depends on noise, this change is averaged over noise realisations.
         """
         realisations = max((effect.kind.noise_realisations for effect in self.effects), default=0)
-        exposures = self._exposures(expected)
-        if not realisations:
-            mean = self._through_readout(expected, exposures)
-        else:
-            mean = list(exposures)
-            for number in range(realisations):
-                noisy = self._noisy(expected, [seed, _REALISATIONS_STREAM, number])
-                for n, after in enumerate(self._through_readout(expected, noisy)):
-                    mean[n] = mean[n] + (after - noisy[n]) / realisations
-        shots = zip(self._clipped(mean, expected), self.plan.shots, strict=True)
+        mean = list(self._exposures) if realisations else self._through_readout(self._exposures)
+        for number in range(realisations):
+            noisy = self._noisy(_REALISATIONS_STREAM, number)
+            for n, after in enumerate(self._through_readout(noisy)):
+                mean[n] = mean[n] + (after - noisy[n]) / realisations
+        shots = zip(self._clipped(mean), self.plan.shots, strict=True)
         return [dn / shot.exposure_s for dn, shot in shots]
 
-    def _exposures(self, rates: Sequence[Plane]) -> list[Plane]:
-        return [rate * shot.exposure_s for rate, shot in zip(rates, self.plan.shots, strict=True)]
+    @property
+    def _exposures(self) -> list[Plane]:
+        return [rate * shot.exposure_s for rate, shot in zip(self.rates, self.plan.shots, strict=True)]
 
-    def _clipped(self, exposures: Sequence[Plane], expected: Sequence[Plane]) -> list[Plane]:
-        level = self.saturation_dn(expected)
+    def _clipped(self, exposures: Sequence[Plane]) -> list[Plane]:
         return [
-            dn if level is None or shot.gain_mode != HIGH else np.minimum(dn, level)
+            dn if self.level is None or shot.gain_mode != HIGH else np.minimum(dn, self.level)
             for dn, shot in zip(exposures, self.plan.shots, strict=True)
         ]
 
-    def _noisy(self, expected: Sequence[Plane], stream: list[int]) -> list[Plane]:
+    def _noisy(self, *stream: int) -> list[Plane]:
         return [
-            self.plan.noise.observe(rate, shot.exposure_s, np.random.default_rng([*stream, n]))
+            self.plan.noise.observe(rate, shot.exposure_s, np.random.default_rng([self.seed, *stream, n]))
             * shot.exposure_s
-            for n, (rate, shot) in enumerate(zip(expected, self.plan.shots, strict=True))
+            for n, (rate, shot) in enumerate(zip(self.rates, self.plan.shots, strict=True))
         ]
 
-    def _through_readout(self, expected: Sequence[Plane], exposures: Sequence[Plane]) -> list[Plane]:
+    def _through_readout(self, exposures: Sequence[Plane]) -> list[Plane]:
         out, earlier = [], list[Earlier]()
-        for index, (rate, dn) in enumerate(zip(expected, exposures, strict=True)):
+        for index, (before, dn) in enumerate(zip(self._exposures, exposures, strict=True)):
             moment = Moment(self.plan, index)
             out.append(apply_effects(self.effects, "read_out", dn, moment, earlier))
-            earlier.append(Earlier(rate * moment.shot.exposure_s, moment.shot.time_s))
+            earlier.append(Earlier(before, moment.shot.time_s))
         return out
+
+
+def focal_planes(clean: EffectFree, effects: Sequence[Effect]) -> Iterator[Plane]:
+    """The light of every image in the focal plane, on fine pixels [y, x], DN/s, with effects of the steps up to it."""
+    varies = any(effect.kind.varies for effect in effects)
+    for index in range(len(clean.plan.shots)):
+        moment = Moment(clean.plan, index)
+        if index == 0 or varies:
+            optics = apply_effects(effects, "optics", clean.optics, moment)
+        lit = lit_scene(clean, effects, moment)
+        yield apply_effects(effects, "spread", optics.through.apply(lit), lit, optics, moment)
 
 
 def lit_scene(clean: EffectFree, effects: Sequence[Effect], moment: Moment) -> Plane:

@@ -1,4 +1,4 @@
-"""The residual that an effect leaves in the discs of noise-free images, before and after the PSF is refitted.
+"""The residual that an effect leaves in the discs of noise-free images after the PSF is refitted.
 
     e_i = -100 mean(D [y_i - H (1 - D) x_i]) / mean(D y_i)                                               Eq. (1)
     left = rms over images of (e_i with the effect - e_i without the effect)                             Eq. (2)
@@ -13,8 +13,7 @@ strength of an effect. The residuals in the truth of a case come from a full inv
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,18 +31,6 @@ Plane = NDArray[np.floating]
 Kernel = NDArray[np.float64]
 Vector = NDArray[np.float64]
 _WARM_STEPS = 3
-
-
-@dataclass(frozen=True)
-class Left:
-    """The residual that an effect leaves in the discs, percent, rms over images.
-
-    by_image_pct: for each image, the residual after the refit, with its sign.
-    """
-
-    before_refit_pct: float
-    after_refit_pct: float
-    by_image_pct: list[float]
 
 
 class LinearEstimator:
@@ -69,8 +56,8 @@ class LinearEstimator:
         self._weights = [clean.weight(n, expected[n]) for n in images]
         self._observed = [float(clean.observed(n).mean()) for n in images]
 
-    def left(self, images: Sequence[Plane]) -> Left:
-        """The residual that an effect leaves. images: all images with the effect [y, x], DN/s."""
+    def left_pct(self, images: Sequence[Plane]) -> float:
+        """Eq. (2) after the refit, percent. images: all images with the effect [y, x], DN/s."""
         clean = self._clean
         frames = (
             replace(frame, pixels=pixels) for frame, pixels in zip(clean.transit.frames, images, strict=True)
@@ -81,40 +68,33 @@ class LinearEstimator:
             sky.improve(n, clean.optics, _WARM_STEPS)
         changed = replace(clean, transit=transit, sky=sky)
         changes = [changed.residual(n)[0] - before for n, before in enumerate(self._residuals)]
-        before_pct, after_pct = self._percent(changes), self._percent(self._refitted(changes))
-        return Left(rms(before_pct), rms(after_pct), after_pct)
+        return rms(self._left_by_image(changes))
 
     def clean_left_pct(self) -> list[float]:
-        """The residual of every image without effects after the refit, e_i of Eq. (1), percent: what sampling on pixels leaves."""
-        return self._percent(self._refitted(self._residuals))
+        """The residual of every image without effects after the refit, e_i of Eq. (1), percent: what sampling on
+        pixels leaves."""
+        return self._left_by_image(self._residuals)
 
-    def _refitted(self, residuals: Sequence[Vector]) -> list[Vector]:
-        """Eq. (3)."""
+    def _left_by_image(self, residuals: Sequence[Vector]) -> list[float]:
+        """Eq. (1) for each image: simulated minus observed, after the refit of Eq. (3)."""
         jacobian = np.concatenate(self._jacobians, axis=1)
         weighted = jacobian * np.concatenate(self._weights)
         step = np.linalg.lstsq(weighted @ jacobian.T, weighted @ np.concatenate(residuals), rcond=1e-12)[0]
-        return [r - own.T @ step for r, own in zip(residuals, self._jacobians, strict=True)]
-
-    def _percent(self, residuals: Sequence[Vector]) -> list[float]:
-        """Eq. (1): simulated minus observed, for each image."""
-        means = zip(residuals, self._observed, strict=True)
-        return [-100 * float(residual.mean()) / observed for residual, observed in means]
+        every = zip(residuals, self._jacobians, self._observed, strict=True)
+        return [-100 * float((r - own.T @ step).mean()) / observed for r, own, observed in every]
 
 
-def refitted(frames: Sequence[Frame], diffraction: Kernel, law: ScatterTruth, noise: Noise) -> dict[str, Any]:
-    """Refit the PSF to nearly noise-free images. The fit starts at the true parameters.
+def refitted(
+    frames: Sequence[Frame], diffraction: Kernel, law: ScatterTruth, noise: Noise
+) -> dict[str, tuple[float, float]]:
+    """The residual e_i of Eq. (1) and its noise, percent, by file, after the PSF is refitted to nearly noise-free
+    images.
 
-    The result is JSON: residual_pct, the residual e_i of Eq. (1), and noise_pct, its noise, both by the number of the
-    image as text; values, the fitted parameters of the scatter. Raises the errors of psfcore.scatter.inversion.invert.
+    The fit starts at the true parameters. Raises the errors of psfcore.scatter.inversion.invert.
     """
     transit = Transit(frames=tuple(frames), diffraction=diffraction, noise=noise)
-    inversion = invert(transit, start=true_coordinates(law)).inversion
-    number = {frame.file: str(n) for n, frame in enumerate(frames)}
-    return {
-        "residual_pct": {number[fit.file]: fit.residual_pct for fit in inversion.frames},
-        "noise_pct": {number[fit.file]: 100 * fit.noise / fit.observed for fit in inversion.frames},
-        "values": inversion.values,
-    }
+    fits = invert(transit, start=true_coordinates(law)).inversion.frames
+    return {fit.file: (fit.residual_pct, 100 * fit.noise / fit.observed) for fit in fits}
 
 
 def rms(values: Sequence[float]) -> float:

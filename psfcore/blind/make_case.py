@@ -8,6 +8,7 @@ that the effect really leaves is measured and stored in the truth.
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -20,85 +21,93 @@ from psfcore.blind.cases import Case, case_scenes
 from psfcore.blind.chain import Chain, EffectFree
 from psfcore.blind.effects.effect import Effect
 from psfcore.blind.effects.fine_optics import binned_glass, fine_optics
-from psfcore.blind.leftover import Left, LinearEstimator, refitted, rms
-from psfcore.simulate.plan import HIGH, Plan
+from psfcore.blind.leftover import LinearEstimator, refitted, rms
+from psfcore.simulate.plan import HIGH
 from psfcore.simulate.transit import reported_places, write_observation
 from psfcore.transit.prepare import Exposure, prepare
 from psfcore.transit.transit import Frame
 
 Plane = NDArray[np.float64]
-WITH_EFFECTS, WITHOUT_EFFECTS = "with_effects", "without_effects"
+WITHOUT_EFFECTS, CAUSES_FILE = "without_effects", "causes.json"
 TRIALS = 2
 STRENGTH_WITHIN = 1.4  # a strength is accepted if its residual is within this factor of the target
 MAP_POINTS = 64  # number of points of a map along each axis
 
 
 def make(case: Case, transit: Path, expected: Path, images: Sequence[Plane] = ()) -> dict[str, Any]:
-    """Make the scenes, set the strengths, simulate the exposures, and measure what the effects leave. Returns the truth.
+    """Make the scenes, set the strengths, simulate the exposures, and measure what the effects leave. Returns the
+    truth.
 
-    transit: a new folder for the transit; its files name no effect. expected: a new folder; if the case has effects, it
-    gets two transits without noise for the ideal observer, WITH_EFFECTS and WITHOUT_EFFECTS. images: [y, x] in DN/s;
-    scenes are cut from them. Empty: synthetic scenes. Raises DataError "bad-scene", and the errors of
-    `psfcore.scatter.inversion.invert`.
+    transit: a new folder for the transit; its files name no effect. expected: a new folder. If the case has effects, it
+    gets transits without noise: WITHOUT_EFFECTS, and one with each effect alone; CAUSES_FILE (gap-causes/1) lists them.
+    images: [y, x] in DN/s; scenes are cut from them. Empty: synthetic scenes. Raises DataError "bad-scene", and the
+    errors of `psfcore.scatter.inversion.invert`.
     """
-    plan = case.plan
+    plan, diffraction = case.plan, binned_glass(case.glass)
     effect_free = EffectFree(plan, fine_optics(case.law, case.glass, plan.size_px), case_scenes(case, images))
-    diffraction = binned_glass(case.glass)
-    clean = Chain(effect_free, ()).all_expected()
-    level = _level(case, clean)
-    estimator = LinearEstimator(_frames(plan, clean, None), diffraction, case.law, plan.noise)
-    alone = [
-        _at_target(effect, target, case, effect_free, estimator)
-        for effect, target in zip(case.effects, case.target_pct, strict=True)
-    ]
-    chain = Chain(effect_free, [effect for effect, _ in alone], level)
-    rates = chain.all_expected()
-    level = chain.saturation_dn(rates)
+    clean = Chain(effect_free, (), case.seed, case.headroom)
+    estimator = LinearEstimator(_frames(clean), diffraction, case.law, plan.noise)
+    targets = zip(case.effects, case.target_pct, strict=True)
+    alone = [_at_target(effect, target, clean, estimator) for effect, target in targets]
+    whole = clean.with_effects(*(one.effects[0] for one, _ in alone))
     places = reported_places(plan, case.seed)
-    saturating = dataclasses.replace(plan, saturation_dn=level)
-    whole_dn = [dn.astype(np.int32) for dn in chain.read_out(rates, case.seed)]
-    write_observation(transit, saturating, whole_dn, places, diffraction)
-    clean_left = estimator.clean_left_pct()
-    truth = {
+
+    def write(folder: Path, exposures: Sequence[NDArray[Any]], level: float | None) -> None:
+        own = dataclasses.replace(plan, saturation_dn=level)
+        write_observation(folder, own, exposures, places, diffraction)
+
+    write(transit, [dn.astype(np.int32) for dn in whole.read_out()], whole.level)
+    effects = [_effect(one, left_pct, clean) for one, left_pct in alone]
+    residuals = list[dict[str, float]]()
+    if effects:
+        chains = {WITHOUT_EFFECTS: clean} | {f"effect_{n}": one for n, (one, _) in enumerate(alone)}
+        for name, chain in chains.items():
+            means = zip(chain.mean, plan.shots, strict=True)
+            write(expected / name, [rate * shot.exposure_s for rate, shot in means], chain.level)
+        causes = [
+            {
+                "folder": f"effect_{n}",
+                "name": one["cause"],
+                "families": one["families"],
+                "stage": one["stage"],
+            }
+            for n, one in enumerate(effects)
+        ]
+        (expected / CAUSES_FILE).write_text(json.dumps({"schema": "gap-causes/1", "causes": causes}))
+        fits = refitted(_frames(whole), diffraction, case.law, plan.noise)
+        residuals = [
+            {"residual_pct": fits[_file(n)][0], "noise_pct": fits[_file(n)][1], "clean_pct": clean_pct}
+            for n, clean_pct in enumerate(estimator.clean_left_pct())
+            if _file(n) in fits
+        ]
+    return {
         "number": case.number,
         "seed": case.seed,
         "kind": case.kind,
         "glass": dataclasses.asdict(case.glass),
         "target_pct": list(case.target_pct),
-        "effects": [],
+        "effects": effects,
         "psf": {"b": case.law.b_px, "c": case.law.c, "total": case.law.total},
         "exact": [{"x": shot.x_px, "y": shot.y_px} for shot in plan.shots],
-        "plan": saturating.as_json(),
-        "left_before_refit_pct": 0.0,
-        "left_after_refit_pct": 0.0,
-        "clean_left_pct": rms(clean_left),
+        "plan": dataclasses.replace(plan, saturation_dn=whole.level).as_json(),
+        "left_after_refit_pct": rms([one["residual_pct"] - one["clean_pct"] for one in residuals]),
+        "residuals": residuals,
     }
-    if not alone:
-        return truth
-    mean = chain.mean_rate(rates, case.seed)
-    for name, rate_planes, of in ((WITH_EFFECTS, mean, saturating), (WITHOUT_EFFECTS, clean, plan)):
-        exposures = [rate * shot.exposure_s for rate, shot in zip(rate_planes, plan.shots, strict=True)]
-        write_observation(expected / name, of, exposures, places, diffraction)
-    frames = _frames(plan, mean, level)
-    whole = refitted(frames, diffraction, case.law, plan.noise)
-    both = [(whole["residual_pct"].get(str(n)), value) for n, value in enumerate(clean_left)]
-    quick = estimator.left([frame.pixels for frame in frames])
-    truth |= {
-        "effects": [effect.as_json() | _left_alone(left, whole["noise_pct"]) for effect, left in alone],
-        "left_before_refit_pct": quick.before_refit_pct,
-        "left_after_refit_pct": rms([value - before for value, before in both if value is not None]),
-        "left_after_refit_first_order_pct": quick.after_refit_pct,
-        "clean_by_image_pct": {str(n): value for n, value in enumerate(clean_left)},
-        "refitted": whole,
-    }
-    if any(effect.kind.adds_light for effect, _ in alone):
-        added = np.mean(mean, axis=0) - np.mean(clean, axis=0)
-        truth["light_map"] = {"size_px": plan.size_px, "values": _map(added)}
-    return truth
+
+
+def _effect(chain: Chain, left_pct: float, clean: Chain) -> dict[str, Any]:
+    """The entry of an effect in the truth. chain: the case with this effect alone."""
+    (effect,) = chain.effects
+    entry = effect.as_json() | {"left_alone_pct": left_pct}
+    if effect.kind.adds_light:
+        added = np.mean(chain.mean, axis=0) - np.mean(clean.mean, axis=0)
+        entry["light_map"] = {"size_px": chain.plan.size_px, "values": _map(added)}
+    return entry
 
 
 def _map(change: Plane) -> list[list[float]]:
-    """The change of the images [y, x], DN/s, at MAP_POINTS x MAP_POINTS points, each the mean of a box around the point."""
+    """The change of the images [y, x], DN/s, at MAP_POINTS x MAP_POINTS points, each the mean of a box around the
+    point."""
     step = change.shape[0] / MAP_POINTS
     at = (np.arange(MAP_POINTS) + 0.5) * step - 0.5
     boxes = uniform_filter(change, max(1, round(step)), mode="nearest")
@@ -108,59 +117,45 @@ def _map(change: Plane) -> list[list[float]]:
 
 
 def _at_target(
-    effect: Effect, target_pct: float | None, case: Case, effect_free: EffectFree, estimator: LinearEstimator
-) -> tuple[Effect, Left]:
-    """The effect with the chosen strength, and the residual that it leaves.
+    effect: Effect, target_pct: float | None, clean: Chain, estimator: LinearEstimator
+) -> tuple[Chain, float]:
+    """The images with this effect alone at the chosen strength, and the residual that it leaves, percent, to first
+    order.
 
-    The strength is chosen to leave a residual of about target_pct, but is at most the largest plausible strength. None: the
-    strength is not changed.
+    The strength is chosen to leave a residual of about target_pct, but is at most the largest plausible strength.
+    None: the strength is not changed.
     """
-    left = _quick_left(effect, case, effect_free, estimator)
-    for _ in range(TRIALS):
-        if target_pct is None:
+    for trial in range(TRIALS + 1):
+        chain = clean.with_effects(effect)
+        left_pct = estimator.left_pct([frame.pixels for frame in _frames(chain)])
+        if target_pct is None or trial == TRIALS:
             break
-        short = target_pct / max(left.after_refit_pct, 1e-6)
-        if max(short, 1 / short) < STRENGTH_WITHIN:
-            break
+        short = target_pct / max(left_pct, 1e-6)
         strength = float(min(effect.strength * short ** (1 / effect.kind.power), effect.kind.largest))
-        if strength == effect.strength:  # even the largest strength leaves less than the target
+        # The largest strength may leave less than the target.
+        if max(short, 1 / short) < STRENGTH_WITHIN or strength == effect.strength:
             break
         effect = effect.at(strength)
-        left = _quick_left(effect, case, effect_free, estimator)
-    return effect, left
+    return chain, left_pct
 
 
-def _quick_left(effect: Effect, case: Case, effect_free: EffectFree, estimator: LinearEstimator) -> Left:
-    """The residual that one effect alone leaves in the discs, to first order."""
-    chain = Chain(effect_free, (effect,))
-    rates = chain.all_expected()
-    frames = _frames(case.plan, chain.mean_rate(rates, case.seed), chain.saturation_dn(rates))
-    return estimator.left([frame.pixels for frame in frames])
+def _file(n: int) -> str:
+    return f"{n:03d}.fits"
 
 
-def _left_alone(left: Left, noise_pct: dict[str, float]) -> dict[str, float]:
-    """The residual that an effect leaves without the other effects of the case, after a refit, to first order.
-
-    left_alone_pct: the residual in percent, rms over images. left_alone_chi2: the sum over images of (residual /
-    noise)^2, with the residual and the noise of the disc mean.
-    """
-    by_image = enumerate(left.by_image_pct)
-    shown = sum((pct / noise_pct[str(n)]) ** 2 for n, pct in by_image if str(n) in noise_pct)
-    return {"left_alone_pct": left.after_refit_pct, "left_alone_chi2": float(shown)}
-
-
-def _frames(plan: Plan, rates: Sequence[Plane], level: float | None) -> tuple[Frame, ...]:
-    """Frames with the exact positions of the occulter. Clipped pixels are filled in the same way as when a transit is read."""
+def _frames(chain: Chain) -> tuple[Frame, ...]:
+    """Frames of mean images, with the exact positions of the occulter. Clipped pixels are filled as in a transit from
+    a folder."""
     exposures = []
-    for n, (rate, shot) in enumerate(zip(rates, plan.shots, strict=True)):
-        clips = level is not None and shot.gain_mode == HIGH
-        gaps = rate * shot.exposure_s >= (level if clips and level is not None else np.inf) * (1 - 1e-9)
+    for n, (rate, shot) in enumerate(zip(chain.mean, chain.plan.shots, strict=True)):
+        level = chain.level if chain.level is not None and shot.gain_mode == HIGH else np.inf
+        gaps = rate * shot.exposure_s >= level * (1 - 1e-9)
         exposures.append(
             Exposure(
-                file=f"{n:03d}.fits",
+                file=_file(n),
                 pixels=rate.astype(np.float32),
                 pointing=shot.pointing,
-                place=plan.place(n),
+                place=chain.plan.place(n),
                 exposure_s=shot.exposure_s,
                 time_s=shot.time_s,
                 gain_mode=shot.gain_mode,
@@ -169,11 +164,3 @@ def _frames(plan: Plan, rates: Sequence[Plane], level: float | None) -> tuple[Fr
             )
         )
     return prepare(exposures)[0]
-
-
-def _level(case: Case, rates: Sequence[Plane]) -> float | None:
-    """The saturation level (DN) of the case; it is above the brightest pixel. None: no saturation."""
-    if case.headroom is None:
-        return None
-    shots = zip(rates, case.plan.shots, strict=True)
-    return float(np.rint(case.headroom * max(float(rate.max()) * shot.exposure_s for rate, shot in shots)))

@@ -1,10 +1,11 @@
 """Diagnose a blind set. A separate process diagnoses each case and sees only a copy of its transit.
 
-The copy is in a temporary folder whose name does not contain the number of the case. The process runs in this folder. Its
-report is copied to the set when it is complete. A case that has a report is not diagnosed again. If a diagnosis fails, the
-failure is written to run.json, and the next run tries the case again.
+The copy is in a temporary folder whose name does not contain the number of the case. The process runs in this folder.
+Its report is copied to the set when it is complete. A case that has a report is not diagnosed again. If a diagnosis
+fails, the failure is written to run.json, and the next run tries the case again.
 
-A further process computes what an ideal observer could know about the case, from a copy of its images without noise.
+A further process computes the bound of the case, what a Bayes observer could know, from a copy of its images without
+noise.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ from psfcore.errors import DataError
 from psfcore.files import write_whole
 
 # For each schema, the keys that a complete result has.
-REPORT_SCHEMA, IDEAL_SCHEMA = "gap/2", "gap-ideal/1"
-_KEYS = {REPORT_SCHEMA: {"verdict", "set"}, IDEAL_SCHEMA: {"noncentrality", "hypotheses"}}
+REPORT_SCHEMA, BOUND_SCHEMA = "gap/3", "gap-bound/1"
+_KEYS = {REPORT_SCHEMA: {"verdict", "causes"}, BOUND_SCHEMA: {"causes"}}
 LONGEST_S = 1800.0
 _KIB = 1024
 _LAST_WORDS = 2000
@@ -38,18 +39,14 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Run:
-    """One diagnosis: its wall time, its largest memory and its exit status. error: the reason if it gave no report."""
+    """One run of a program: its wall time, its largest memory and its exit status. error: the reason if it gave no
+    result."""
 
     case: int
     wall_s: float
     peak_mib: float
     status: int
     error: str = ""
-
-    @property
-    def failed(self) -> bool:
-        """Whether the diagnosis gave no report."""
-        return bool(self.error)
 
 
 def run_set(
@@ -58,59 +55,50 @@ def run_set(
     command: Sequence[str],
     *,
     processes: int = 1,
-    ideal: Sequence[str] = (),
+    bound: Sequence[str] = (),
     keep: bool = False,
     longest_s: float = LONGEST_S,
     progress: Progress = lambda line: None,
 ) -> list[Run]:
     """Diagnose the cases that have no report yet. Returns one run for each of these cases, in the order of `numbers`.
 
-    command: a program and its arguments; {transit} and {report} stand for the paths. processes: number of diagnoses at
-    the same time. ideal: a program and its arguments; it computes what an ideal observer could know. {expected} and
-    {ideal} stand for the paths. If `ideal` is empty, no program is run. If the program fails, the diagnosis is not
-    affected, and the next run tries the program again. keep: whether to keep the images of a case after their use.
-    longest_s: a process that takes longer is killed. Raises DataError "bad-command", "bad-seals", and "not-sealed" if
-    a case has no seal.
+    command: a program and its arguments; {transit} and {report} stand for the paths. processes: number of diagnoses
+    at the same time. bound: a program and its arguments; it computes the bound. {expected} and {bound} stand for the
+    paths. If `bound` is empty, no program is run. If the program fails, the diagnosis is not affected, and the next
+    run tries the program again. keep: whether to keep the images of a case after their use. longest_s: a process that
+    takes longer is killed. Raises DataError "bad-command", "bad-seals", and "not-sealed" if a case has no seal.
     """
-    for some, marks in ((command, ("{transit}", "{report}")), (ideal, ("{expected}", "{ideal}"))):
-        if some and not all(any(mark in part for part in some) for mark in marks):
+    for words, marks in ((command, ("{transit}", "{report}")), (bound, ("{expected}", "{bound}"))):
+        if words and not all(any(mark in word for word in words) for mark in marks):
             raise DataError(
-                "bad-command", f"expected {' and '.join(marks)} in the command; got {' '.join(some)}"
+                "bad-command", f"expected {' and '.join(marks)} in the command; got {' '.join(words)}"
             )
     for number in numbers:
         if not made.is_made(number):
             raise DataError(
                 "not-sealed",
-                f"case {number:04d}: expected a truth that was sealed before the diagnosis; got no seal: make the case again",
+                f"case {number:04d}: expected a truth that was sealed before the diagnosis; got no seal: make the "
+                "case again",
             )
 
-    def diagnose(number: int) -> Run | None:
-        if result_in(made.report(number), REPORT_SCHEMA) is not None:
+    def result(number: int, words: Sequence[str], folder: Path, file: Path, schema: str) -> Run | None:
+        """Run a program if its result is missing. Its images are deleted after their use."""
+        if not words or not folder.is_dir():
             return None
-        run = _run(number, command, made.transit(number), made.report(number), REPORT_SCHEMA, longest_s)
-        write_whole(made.case_folder(number) / "run.json", json.dumps(asdict(run), indent=1))
-        if not run.failed and not keep:
-            shutil.rmtree(made.transit(number))
-        what = f"failed: {run.error.splitlines()[-1]:.100}" if run.failed else "diagnosed"
-        progress(f"case {number:04d} {what}, {run.wall_s:.1f} s, {run.peak_mib:.0f} MiB")
+        run = None
+        if result_in(file, schema) is None:
+            run = _run(number, words, folder, file, schema, longest_s)
+            what = f"no {file.stem}: {run.error.splitlines()[-1]:.100}" if run.error else f"{file.stem} made"
+            progress(f"case {number:04d}: {what}, {run.wall_s:.1f} s, {run.peak_mib:.0f} MiB")
+        if not keep and not (run and run.error):
+            shutil.rmtree(folder)
         return run
 
-    def observe(number: int) -> None:
-        expected, file = made.expected(number), made.ideal(number)
-        if not ideal or not expected.is_dir():
-            return
-        if result_in(file, IDEAL_SCHEMA) is None:
-            run = _run(number, ideal, expected, file, IDEAL_SCHEMA, longest_s)
-            if run.failed:
-                progress(f"case {number:04d} has no ideal observer: {run.error.splitlines()[-1]:.100}")
-                return
-            progress(f"case {number:04d}: ideal observer computed, {run.wall_s:.1f} s")
-        if not keep:
-            shutil.rmtree(expected)
-
     def one(number: int) -> Run | None:
-        run = diagnose(number)
-        observe(number)
+        run = result(number, command, made.transit(number), made.report(number), REPORT_SCHEMA)
+        if run is not None:
+            write_whole(made.case_folder(number) / "run.json", json.dumps(asdict(run), indent=1))
+        result(number, bound, made.expected(number), made.bound(number), BOUND_SCHEMA)
         return run
 
     with ThreadPoolExecutor(max(1, processes)) as pool:
@@ -124,7 +112,7 @@ def run_of(made: BlindSet, number: int) -> Run | None:
 
 
 def result_in(file: Path, schema: str) -> dict[str, Any] | None:
-    """The complete result of this schema in a file; None if there is none. schema: REPORT_SCHEMA or IDEAL_SCHEMA."""
+    """The complete result of this schema in a file; None if there is none. schema: REPORT_SCHEMA or BOUND_SCHEMA."""
     try:
         found = json.loads(file.read_text("utf-8"))
     except (OSError, ValueError):
@@ -138,10 +126,10 @@ def _run(number: int, command: Sequence[str], folder: Path, file: Path, schema: 
     with tempfile.TemporaryDirectory(prefix=f"{folder.name}-") as temporary:
         source, result = Path(temporary) / folder.name, Path(temporary) / file.name
         shutil.copytree(folder, source)
-        paths = {f"{{{folder.name}}}": source, f"{{{file.stem}}}": result}
-        filled = list(command)
-        for mark, path in paths.items():
-            filled = [part.replace(mark, str(path)) for part in filled]
+        filled = [
+            word.replace(f"{{{folder.name}}}", str(source)).replace(f"{{{file.stem}}}", str(result))
+            for word in command
+        ]
         status, wall_s, peak_mib, said = _watched(filled, Path(temporary), longest_s)
         error = f"exit status {status}: {said}" if status else ""
         if not error and result_in(result, schema) is None:

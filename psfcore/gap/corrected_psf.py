@@ -39,12 +39,12 @@ def corrected_psf(found: Diagnosis, name: str, version: str, provenance: dict[st
     without and with these effects, and the input files. Raises DataError "no-answer" if the diagnosis made no full refit,
     "bad-effects" if an added effect fails, and the errors of `Psf`.
     """
-    added = found.correctable
+    added = found.corrected
     if added is None:
         raise DataError(
             "no-answer",
             "expected a diagnosis that names an effect and fitted it together with the PSF; got the verdict "
-            f"{found.judgement.verdict}: this diagnosis has no corrected PSF",
+            f"{found.answer.verdict}: this diagnosis has no corrected PSF",
         )
     inversion = added.solution.inversion
     history = {
@@ -54,7 +54,7 @@ def corrected_psf(found: Diagnosis, name: str, version: str, provenance: dict[st
             parameter: {"value": value, "sigma": sigma, "unit": unit}
             for parameter, (value, sigma, unit) in added.values.items()
         },
-        "verdict": found.judgement.verdict,
+        "verdict": found.answer.verdict,
         "gap_before_pct": found.rms.to_json(),
         "gap_after_pct": found.after.to_json(),
         "inputs_sha256": added.solution.transit.sha256,
@@ -70,8 +70,7 @@ def _kernel(added: Corrected) -> Kernel:
     grid = (REACH_GRID_PX, REACH_GRID_PX)
     total = TotalPsf(solution.transit.diffraction, solution.inversion.shape, grid, threads=solution.threads)
     kernel = np.maximum(total.kernel(solution.inversion.coordinates), 0.0)
-    # A field of the optics (`evidence.fields`) changes the PSF over the field, and not in the centre of the field.
-    optical = [effect for effect in added.effects if effect.stage == "optics" and not effect.exact]
+    optical = [effect for effect in added.effects if effect.stage == "optics"]
     if not optical:
         return kernel
     middle = REACH_GRID_PX // 2

@@ -1,17 +1,15 @@
-"""The diagnosis of a transit: noise, fit, expected gap, evidence, verdict, full refits, location and closure of the gap.
+"""The diagnosis of a transit: noise, fit, expected gap, evidence, answer, location and closure of the gap.
 
 The steps, in this order:
 
 1. Measure the noise of the images.
 2. Fit the PSF.
 3. Simulate the transit from this fit, fit the simulation, and keep its residuals: the expected gap.
-4. Compute how the discs and the unocculted field respond to every effect.
-5. Compute the posterior of all hypotheses about the cause, with full refits where the linear model is not exact enough.
-6. Read the verdict off the posterior. The effects that the verdict names are called "the named effects" here
-   (`Judgement.answer`, "answer" in the report).
-7. Make a full refit with the named effects in the model. Each refit is made only once. If the verdict is a tie, the best of the
-   tied hypotheses is refitted.
-8. Locate the gap, and compute gap and closure on held-out images.
+4. Compute how the discs and the unocculted field respond to every effect and every field.
+5. Weigh all hypotheses in closed form, and read the answer off their probabilities (`verdict.answer`).
+6. Fit the told causes: the most probable alternative of each cause, without the Sun. If they are effects of the library, make one
+   full refit with them in the model; it gives the corrected PSF.
+7. Locate the gap, and compute gap and closure on held-out images.
 """
 
 from __future__ import annotations
@@ -23,14 +21,16 @@ import numpy as np
 
 from psfcore.errors import DataError
 from psfcore.gap.effect import Effect
-from psfcore.gap.evidence.effect_fits import EffectFit, fit_effects, p_value_of_gap
+from psfcore.gap.evidence.closed_form import Variant
+from psfcore.gap.evidence.columns import FieldShape, with_effect
+from psfcore.gap.evidence.effect_fits import EffectFit, fit_effects, label_of, p_value_of_gap
 from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.expected_gap import ExpectedGap, linear_model_of
-from psfcore.gap.evidence.fields import UNKNOWN, Field, FieldColumns, fields_of
 from psfcore.gap.evidence.linear_model import LinearModel
 from psfcore.gap.evidence.measured_noise import MeasuredNoise, measured_noise
 from psfcore.gap.library.registry import LIBRARY
 from psfcore.gap.library.scene import MOST_POINTINGS
+from psfcore.gap.verdict.answer import LEAST_IMAGES, Alternative, Answer, answer_of
 from psfcore.gap.verdict.calibration import COVERAGE, Calibration, shipped_calibration
 from psfcore.gap.verdict.closure import (
     HeldOut,
@@ -42,24 +42,20 @@ from psfcore.gap.verdict.closure import (
     pointings,
     time_blocks,
 )
-from psfcore.gap.verdict.correction import Corrected
+from psfcore.gap.verdict.correction import Corrected, add_to_model
 from psfcore.gap.verdict.limits import Limits, limits
-from psfcore.gap.verdict.posterior import NONE, Form, posterior
-from psfcore.gap.verdict.refits import Refits, linear_start, settled_posterior
-from psfcore.gap.verdict.unknown import UnknownField, bounds, unknown_fields
-from psfcore.gap.verdict.verdict import LEAST_IMAGES, Judgement, earned, verdict_of
 from psfcore.gap.verdict.where import Axis, where
-from psfcore.gap.view import View
+from psfcore.gap.view import View, return_unused_memory
 from psfcore.psf import Psf
 from psfcore.scatter.inversion import Inverter, solution_of
-from psfcore.scatter.reconstruction import Progress, Solution
+from psfcore.scatter.reconstruction import Progress, Solution, labelled
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Shape, Vector, shape_named
-from psfcore.transit.transit import Transit
+from psfcore.transit.transit import Fold, Transit
 
 
 @dataclass(frozen=True, eq=False)
 class Shrinking:
-    """How far an effect closes the gap.
+    """How far causes close the gap.
 
     closure: the closure if blocks of time are held out. closure_by_pointing: the closure if one pointing at a time is held
     out. Both are None if there is no gap. held_out_fall: `closure.fall` for the blocks of time.
@@ -74,21 +70,19 @@ class Shrinking:
 class Diagnosis:
     """The diagnosis of one transit.
 
-    Three values of the gap: before_refit, with the PSF that was fitted together with the named effects, but without these
-    effects; rms, with the PSF refitted without any effect; after, with the named effects in the model. fits: the linear
-    fits, by form: of all single effects, the most probable first; then of the hypotheses that are best or decide the verdict, and of
-    the fields of an unknown cause. p_value:
-    the p-value of the gap. limits: the limits of all effects. shrinking: how far the effects close the gap, by
-    form. corrected: the full refits with the named effects that were made; the refit with the best effects comes first.
-    with_field: for the verdict `unknown`, the full refit with the most probable field, if it was made. unknown: the
-    fields of an unknown cause, if it is in the answer set. bounds: the bound of each field (`unknown.bounds`). residual,
-    residual_after: the residuals of held-out images without and with the best effects. cautions: sentences on
-    everything that weakens the result.
+    Three values of the gap: before_refit, with the PSF that was fitted together with the told causes, but without them; rms, with the
+    PSF refitted without any cause; after, with the told causes in the model. fits: the linear fits of all single effects, by name, the
+    most probable first. told: the linear fit of the told causes together; None if there are none. p_value: the p-value of the gap.
+    limits: the limits of all effects. shrinking: how far each single effect closes the gap, by name. shrinking_of_told: the same for
+    the told causes. corrected: the full refit with the told causes, if they are effects of the library and the refit succeeded. shapes:
+    the shape of each alternative that is another form of its family, by the name of the family. residual, residual_after: the residuals
+    of held-out images without and with the told causes. cautions: sentences on everything that weakens the result.
     """
 
-    judgement: Judgement
+    answer: Answer
     calibration: Calibration
-    fits: Mapping[Form, EffectFit]
+    fits: Mapping[str, EffectFit]
+    told: EffectFit | None
     p_value: float
     limits: Limits
     solution: Solution
@@ -100,11 +94,10 @@ class Diagnosis:
     rms: Interval
     after: Interval
     noise_pct: float
-    shrinking: Mapping[Form, Shrinking]
-    corrected: tuple[Corrected, ...]
-    with_field: Corrected | None
-    unknown: tuple[UnknownField, ...]
-    bounds: Mapping[Field, tuple[float, str]]
+    shrinking: Mapping[str, Shrinking]
+    shrinking_of_told: Shrinking | None
+    corrected: Corrected | None
+    shapes: Mapping[str, FieldShape]
     residual: HeldOut | None
     residual_after: HeldOut | None
     cautions: tuple[str, ...]
@@ -115,17 +108,9 @@ class Diagnosis:
         return self.model.evidence
 
     @property
-    def correctable(self) -> Corrected | None:
-        """The full refit whose PSF is the corrected PSF: with the named effects, or with a field that does not change the PSF."""
-        if self.corrected:
-            return self.corrected[0]
-        field = self.with_field
-        return None if field is None or field.effects[-1].stage == "optics" else field
-
-    @property
     def effects(self) -> tuple[Effect, ...]:
         """The named effects."""
-        return tuple(e for e in self.evidence.effects if e.name in self.judgement.answer)
+        return tuple(e for e in self.evidence.effects if e.name in self.answer.named)
 
 
 def diagnose(
@@ -144,85 +129,182 @@ def diagnose(
 ) -> Diagnosis:
     """Fit a transit and diagnose the residuals of the fit.
 
-    start: the coordinates of the shape from which the fit starts (None: the default start of the shape). refit:
-    whether to make full refits with the named effects in the model. seed: seeds the simulation and the bootstrap of
-    the intervals. solution: an existing solution of this transit, shape and start, or a function that makes it; None:
-    `invert` makes it. If the noise measured in the images differs from the noise that the transit states, the solution
-    must be made with the measured noise. Raises the errors of `psfcore.scatter.inversion.solution_of` and `invert`,
-    DataError "bad-library" if the library is empty, "bad-coverage", and "bad-effects" if an added effect fails.
+    start: the coordinates of the shape from which the fit starts (None: the default start of the shape). refit: whether to make a full
+    refit with the told causes in the model. seed: seeds the simulation and the bootstrap of the intervals. coverage: the probability with
+    which a group of alternatives contains the true cause. solution: an existing solution of this transit, shape and start, or a
+    function that makes it; None: `invert` makes it. If the noise measured in the images differs from the noise that the transit
+    states, the solution must be made with the measured noise. Raises the errors of `psfcore.scatter.inversion.solution_of`
+    and `invert`, DataError "bad-library" if the library is empty, "bad-coverage", and "bad-effects" if an added effect fails.
     """
     if not library:
         raise DataError("bad-library", "expected a library with at least one effect; got none: add an effect")
     calibration = calibration or shipped_calibration()
-    calibration.threshold(coverage)  # refuses a coverage before the long fit
+    level = calibration.level(coverage)  # refuses a coverage before the long fit
     noise = measured_noise(transit)
     if noise is not None and not noise.agrees:
         transit = replace(transit, noise=noise.noise)
     solution = solution_of(transit, shape, solution, start=start, threads=threads, progress=progress)
     view = View(solution)
     model, expected = linear_model_of(view, library, seed=seed, progress=progress)
-    refits = Refits(view, model, progress)
-    settled = posterior(model, refits.columns)
-    if refit:
-        settled = settled_posterior(settled, refits.weighed)
+    progress("hypotheses", 0, 1)
+    answer = answer_of(model, level)
     rng = np.random.default_rng(seed)
-    judged = verdict_of(settled, calibration, images=len(model.evidence.discs), coverage=coverage)
-    told = (
-        unknown_fields(model, refits.columns, settled)
-        if any(UNKNOWN in names for names in judged.members)
-        else ()
-    )
-    fits = linear_fits(refits, model, judged, told)
-    best = next((form for form in fits if judged.best and form == judged.form(judged.best)), None)
-    named = judged.verdict in ("attributed", "tie")
-    corrected = refits.of([judged.form(names) for names in judged.named]) if refit and named else ()
-    with_field = None
-    if refit and judged.verdict == "unknown" and told and told[0].form.refittable:
-        with_field = next(iter(refits.of([told[0].form])), None)
-    held_out = [hold_out(model, (), scheme) for scheme in (time_blocks(model), pointings(model))]
-    shrinking, after = _shrinking(model, judged, fits, refits, held_out, rng)
-    judged = earned(judged, None if best is None else shrinking[best].closure)
-    if judged.verdict == "inconclusive":  # a name that closes too little has no corrected PSF
-        corrected = ()
-    before, gone = held_out[0], None if best is None else after[best]
-    explained = fits[best] if best is not None and judged.answer else None
-    named = judged.verdict in ("attributed", "tie") and gone is not None
+    told, failures = _told(model, answer), list[str]()
+    effects = {
+        effect.name: effect for effect in model.evidence.effects if model.evidence.columns[effect.name]
+    }
+    order = [name for (_, name), _ in answer.labels.items() if name in effects]
+    fits = {name: fit_effects(model, [effects[name]]) for name in dict.fromkeys([*order, *effects])}
+    corrected = None
+    if (
+        refit
+        and told is not None
+        and answer.verdict in ("attributed", "tie")
+        and set(told.names) <= set(effects)
+    ):
+        corrected = _refit(view, model, [effects[name] for name in told.names], told, failures, progress)
+    schemes = (time_blocks(model), pointings(model))
+    held_out = [hold_out(model, (), scheme) for scheme in schemes]
+    closing = _Closing(held_out, schemes, rng, model.scale_error, exists=bool(answer.causes))
+    shrinking = {name: closing.of(fit.model, fit)[0] for name, fit in fits.items()}
+    of_told, after = (None, None) if told is None else closing.of(told.model, told, corrected)
+    before = held_out[0]
     rms = gap(before.residual_pct, before.noise_pct, rng) if before is not None else Interval(0.0, 0.0, 0.0)
-    cautions = [*cautions_of(solution, noise, model.evidence), *refits.failures]
-    if named and best is not None and gone is not None and rms.low > 0:  # the discs show the gap
-        error_pct = float(np.sqrt(np.mean(gone.noise_pct**2)))
-        cautions += caution_of_closure(fits[best].label, rms.value, error_pct)
+    cautions = [*cautions_of(solution, noise, model.evidence), *failures]
+    if told is not None and after is not None and rms.low > 0:  # the discs show the gap
+        cautions += caution_of_closure(told.label, rms.value, float(np.sqrt(np.mean(after.noise_pct**2))))
+    axes = (
+        []
+        if told is None
+        else [axis for e in told.model.evidence.effects if e.name in told.names for axis in e.axes]
+    )
+    if told is None and answer.causes:
+        axes = list(answer.causes[0].alternatives[0].family.axes)
     return Diagnosis(
-        judgement=judged,
+        answer=answer,
         calibration=calibration,
         fits=fits,
+        told=told,
         p_value=p_value_of_gap(model),
-        limits=_limits(model, refits.columns, calibration, coverage, corrected),
+        limits=_limits(answer, corrected),
         solution=solution,
         model=model,
         expected=expected,
         noise=noise,
-        where=where(
-            model if explained is None else explained.model,
-            rng,
-            _favoured(judged, explained, told),
-            None if explained is None else explained.step,
-        ),
-        before_refit=_before_refit(explained, rng) if named and explained is not None else rms,
+        where=where(model if told is None else told.model, rng, axes, None if told is None else told.step),
+        before_refit=rms if told is None else _before_refit(told, rng),
         rms=rms,
-        after=gap(gone.residual_pct, gone.noise_pct, rng) if named and gone is not None else rms,
-        noise_pct=float(np.sqrt(np.mean(before.noise_pct**2)))
-        if before is not None
-        else _noise_pct(model.evidence),
+        after=rms if after is None else gap(after.residual_pct, after.noise_pct, rng),
+        noise_pct=_noise_pct(model.evidence),
         shrinking=shrinking,
+        shrinking_of_told=of_told,
         corrected=corrected,
-        with_field=with_field,
-        unknown=told,
-        bounds=bounds(model, refits.columns, fields_of(model.evidence)),
+        shapes=_shapes(answer),
         residual=before,
-        residual_after=gone if named else None,
+        residual_after=before if after is None else after,
         cautions=tuple(cautions),
     )
+
+
+def _told(model: LinearModel, answer: Answer) -> EffectFit | None:
+    """The linear fit of the most probable alternative of each cause, without the Sun; None if there is nothing to fit."""
+    first = [cause.alternatives[0] for cause in answer.causes]
+    evidence, names = model.evidence, []
+    for one in first:
+        variant = answer.variant((one.family.name, one.effect))
+        if variant is None:
+            continue
+        if variant.form.field is None or (one.effect is not None and one.effect in evidence.columns):
+            names.append(str(one.effect))
+            continue
+        closed, field = answer.closed, variant.form.field
+        effect = closed.columns.effect(field, variant.part.tolist(), variant.width.tolist())
+        discs, blocks = closed.columns.discs(field), closed.columns.all_blocks(field)
+        evidence = with_effect(evidence, effect, discs[..., variant.part], blocks[..., variant.part])
+        names.append(effect.name)
+    if not names:
+        return None
+    model = replace(model, evidence=evidence)
+    effects = [effect for effect in evidence.effects if effect.name in names]
+    fit = fit_effects(model, effects)
+    kept = set(fit.step.columns)
+    if all(kept.intersection(evidence.columns[effect.name]) for effect in effects):
+        return fit
+    return fit_effects(model, effects, any_sign=True)
+
+
+def _shapes(answer: Answer) -> dict[str, FieldShape]:
+    """The shape of each alternative that is another form of its family, by the name of the family."""
+    found = {}
+    for cause in answer.causes:
+        for one in cause.alternatives:
+            variant = answer.variant((one.family.name, one.effect))
+            if variant is not None and variant.form.field is not None:
+                values, covariance = answer.closed.fitted(_with_others(answer, one, variant))
+                own = slice(0, variant.part.size)
+                shape = answer.closed.columns.shape(
+                    variant.form.field, variant.part.tolist(), values[own], covariance[own, own]
+                )
+                found[one.family.name] = shape
+    return found
+
+
+def _with_others(answer: Answer, one: Alternative, variant: Variant) -> list[Variant]:
+    """A variant, followed by the first alternatives of the other causes."""
+    others = [cause.alternatives[0] for cause in answer.causes if one not in cause.alternatives]
+    found = [answer.variant((other.family.name, other.effect)) for other in others]
+    return [variant, *(other for other in found if other is not None)]
+
+
+def _refit(
+    view: View,
+    model: LinearModel,
+    effects: Sequence[Effect],
+    fit: EffectFit,
+    failures: list[str],
+    progress: Progress,
+) -> Corrected | None:
+    """The full refit with these effects; None, and a sentence in `failures`, if it fails."""
+    label = label_of(fit.names)
+    try:
+        told = labelled(progress, f"full refit with {label}")
+        return add_to_model(view.solution, effects, fit, model, view=view, progress=told)
+    except DataError as error:  # the fit may fail if the subtracted effect is not in the images
+        failures.append(f"The full refit with {label} in the model failed: {error}")
+        return None
+    finally:
+        return_unused_memory()
+
+
+@dataclass(frozen=True, eq=False)
+class _Closing:
+    """Computes how far fits close the gap. before: the held-out residuals without any cause, for each scheme. exists: whether there is a gap."""
+
+    before: Sequence[HeldOut | None]
+    schemes: Sequence[Sequence[Fold]]
+    rng: np.random.Generator
+    scale_error: float
+    exists: bool
+
+    def of(
+        self, model: LinearModel, fit: EffectFit, refit: Corrected | None = None
+    ) -> tuple[Shrinking, HeldOut | None]:
+        """The closure by a fit, and the held-out residuals with it. refit: its full refit, whose model is used if there is one."""
+        base = len(model.evidence.base)
+        after = [hold_out(model, fit.step.columns[base:], scheme) for scheme in self.schemes]
+        if refit is not None:
+            real = refit.model
+            refitted = [hold_out(real, real.evidence.of_effects, scheme) for scheme in self.schemes]
+            after = [_better_known(*both) for both in zip(refitted, after, strict=True)]
+        closures = [
+            closure(b, a, self.rng, self.scale_error)
+            if self.exists and b is not None and a is not None
+            else None
+            for b, a in zip(self.before, after, strict=True)
+        ]
+        first, last = self.before[0], after[0]
+        falls = fall(first, last) if first is not None and last is not None else None
+        return Shrinking(closures[0], closures[1], falls), last
 
 
 def start_of(psf: Psf) -> tuple[Shape, Vector]:
@@ -239,97 +321,15 @@ def start_of(psf: Psf) -> tuple[Shape, Vector]:
     return shape_named(psf.fitted.shape), np.array(psf.fitted.coordinates, dtype=np.float64)
 
 
-def _favoured(judged: Judgement, explained: EffectFit | None, told: Sequence[UnknownField]) -> list[str]:
-    """The axes along which the effects of the best hypothesis vary, or the most probable field of an unknown cause.
-
-    Empty if the verdict is `none`.
-    """
-    if judged.verdict == "unknown" and told:
-        return list(told[0].field.axes)
-    if judged.verdict == "none" or explained is None:
-        return []
-    return [axis for e in explained.model.evidence.effects if e.name in explained.names for axis in e.axes]
-
-
-def _limits(
-    model: LinearModel,
-    fields: FieldColumns,
-    calibration: Calibration,
-    coverage: float,
-    refits: Sequence[Corrected],
-) -> Limits:
-    """The limits of all effects.
-
-    If full refits contain an effect, its excluded_95 comes from the best of these refits.
-    """
-    found = limits(
-        model,
-        threshold=calibration.threshold(coverage),
-        temperature=calibration.temperature,
-        fields=fields,
-    )
-    for fit in reversed(refits):
-        for effect in fit.effects:
-            if effect.name in found.effects:
-                found = found.after_refit(effect, fit.parameters(effect.name))
+def _limits(answer: Answer, refit: Corrected | None) -> Limits:
+    """The limits of all effects. excluded_95 of the effects of the full refit comes from this refit."""
+    labels = [(cause.alternatives[0].family.name, cause.alternatives[0].effect) for cause in answer.causes]
+    beside = [variant for variant in map(answer.variant, labels) if variant is not None]
+    found = limits(answer.closed, beside)
+    if refit is not None:
+        for effect in refit.effects:
+            found = found.after_refit(effect, refit.parameters(effect.name))
     return found
-
-
-def linear_fits(
-    refits: Refits, model: LinearModel, judged: Judgement, told: Sequence[UnknownField]
-) -> dict[Form, EffectFit]:
-    """The linear fits of all single effects, the most probable first; then of the best hypothesis and the named ones, in their
-    most probable form, and of the fields of an unknown cause."""
-    effects = {effect.name: effect for effect in model.evidence.effects}
-    ordered = sorted(effects, key=lambda name: -judged.effects.get(name, 0.0))
-    fits = {Form((name,)): fit_effects(model, [effects[name]]) for name in ordered}
-    hypotheses = [names for names in (judged.best or NONE, *judged.named) if names != NONE]
-    forms = [*(judged.form(names) for names in hypotheses), *(one.form for one in told)]
-    for form in forms:
-        if form in fits or not form.refittable:
-            continue
-        with_field = refits.model_with(form)
-        names = form.names(tuple(effects))
-        chosen = [effect for effect in with_field.evidence.effects if effect.name in names]
-        fits[form] = linear_start(with_field, chosen) if form.field else fit_effects(with_field, chosen)
-    return fits
-
-
-def _shrinking(
-    model: LinearModel,
-    judged: Judgement,
-    fits: Mapping[Form, EffectFit],
-    refits: Refits,
-    before: Sequence[HeldOut | None],
-    rng: np.random.Generator,
-) -> tuple[dict[Form, Shrinking], dict[Form, HeldOut | None]]:
-    """Two results for every fit: its closure, and the held-out residuals with its effects.
-
-    before: the held-out residuals without any effect, for the blocks of time and for the pointings. If effects have a full refit,
-    their closure is computed with the model of that refit.
-    """
-    schemes = (time_blocks(model), pointings(model))
-    out: dict[Form, Shrinking] = {}
-    left: dict[Form, HeldOut | None] = {}
-    base = len(model.evidence.base)
-    for form, fit in fits.items():
-        after = [hold_out(fit.model, fit.step.columns[base:], scheme) for scheme in schemes]
-        if form in refits.made:
-            real = refits.made[form].model
-            after = [
-                _better_known(hold_out(real, real.evidence.of_effects, scheme), linear)
-                for scheme, linear in zip(schemes, after, strict=True)
-            ]
-        left[form] = after[0]
-        closures = [
-            closure(b, a, rng, model.scale_error)
-            if judged.verdict != "none" and b is not None and a is not None
-            else None
-            for b, a in zip(before, after, strict=True)
-        ]
-        falls = fall(before[0], after[0]) if before[0] is not None and after[0] is not None else None
-        out[form] = Shrinking(closures[0], closures[1], falls)
-    return out, left
 
 
 def _better_known(real: HeldOut | None, linear: HeldOut | None) -> HeldOut | None:

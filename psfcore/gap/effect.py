@@ -6,8 +6,8 @@ the scene with its occulter. The scene is reconstructed from the image. A change
 light that the model predicts in the disc (`evidence.cells`). The unocculted field shows a change only if it
 differs between the images of one pointing.
 
-The stage of an effect is the step of the light on which it acts: the scene, the optics or the detector. A field
-(`evidence.fields`) that changes the light with time has the stage "time".
+The stage of an effect is the step of the light on which it acts: the scene, the optics or the detector. Its family
+(`evidence.tree`) says what kind of change it is, for example added light that changes with time.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Literal
 
 from psfcore.gap.view import Field, View
 
-Stage = Literal["scene", "optics", "detector", "time"]
+Stage = Literal["scene", "optics", "detector"]
 
 
 @dataclass(frozen=True)
@@ -41,22 +41,18 @@ class Change:
 
     images: one image [y, x] for each image of the transit. To compute the change of the discs, these are the model
     images. To compute the change of the unocculted field, they are the mean images of the pointings. unocculted:
-    whether the change differs between images of one pointing, so that the unocculted field shows it. disc: whether the
-    discs show the change. numbers: how many numbers were measured in the unocculted field to build this change; each
-    of them costs the effect as much as a parameter.
+    whether the change differs between images of one pointing, so that the unocculted field shows it.
     """
 
     change: Callable[[int, Sequence[Field]], Field]
     unocculted: bool = True
-    disc: bool = True
-    numbers: int = 0
 
 
 @dataclass(frozen=True, eq=False)
 class Effect:
     """One effect: its physical cause, the observation that would confirm it, and the axes along which the gap varies.
 
-    cause: a sentence for the report. settled_by: an observation that would confirm the effect, or exclude it. axes: names of
+    family: the name of its family in `evidence.tree`; empty: a family of its own. cause: a sentence for the report. settled_by: an observation that would confirm the effect, or exclude it. axes: names of
     the axes of the report along which the effect varies.
     changes(view): one change for each parameter. An effect that is fitted for each pointing may return fewer or more
     changes than it has parameters. In this case, changes and parameters are paired in order. A change or parameter
@@ -65,7 +61,7 @@ class Effect:
     distinguished(view): how many of these the data distinguish (`search.distinguished`; None: all of them); a larger number
     lowers the evidence. held(view): for an effect that searches for a position or a template, the same effect with the result of
     the search fixed. field: whether the parameters describe a random field, in which each parameter is about as large
-    as `likely`. exact: whether the changes have no template error (`likelihood`).
+    as `likely`.
     """
 
     name: str
@@ -80,4 +76,4 @@ class Effect:
     distinguished: Callable[[View], float] | None = None
     held: Callable[[View], Effect] | None = None
     field: bool = False
-    exact: bool = False
+    family: str = ""

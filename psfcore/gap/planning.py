@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits
 from psfcore.gap.effect import Effect
+from psfcore.gap.evidence.closed_form import ClosedForm
 from psfcore.gap.evidence.expected_gap import linear_model_of
-from psfcore.gap.evidence.linear_model import LinearModel
 from psfcore.gap.library.registry import LIBRARY
-from psfcore.gap.verdict.calibration import shipped_calibration
+from psfcore.gap.verdict.answer import FLOOR
 from psfcore.gap.verdict.limits import Limits, limits
 from psfcore.gap.view import View
 from psfcore.instruments.files import instrument_names
@@ -43,7 +43,6 @@ INSTRUMENT = "hri_euv"
 SCATTER = ScatterTruth(6.15, 2.53, 0.411)  # the scatter of HRI_EUV (Hofmeister et al.)
 BRIGHTNESS_SPREAD = 0.01
 LEAST_IMAGES = 3  # the fit of a PSF needs this number of images
-MEASURED = "its form is measured in the images, so it can be tested only after the observation"
 _BRIGHTNESS_STREAM = 3001
 
 
@@ -76,12 +75,11 @@ class Planned:
     def as_json(self) -> dict[str, Any]:
         """The plan and its limits, schema gap-plan/1. A limit `excluded_95` needs data, so it is missing here."""
         plan = {"images": len(self.plan.shots), "size_px": self.plan.size_px, "pointings": self.pointings}
-        calibration = shipped_calibration()
         distances = sorted(self.limits.distances.items(), key=lambda one: one[1])
         return {
             "schema": SCHEMA,
             "plan": plan,
-            "answer": {"threshold": calibration.threshold(), "temperature": calibration.temperature},
+            "answer": {"floor": FLOOR},
             **self.limits.as_json(observed=False),
             "distances": [{"pair": list(pair), "distance": distance} for pair, distance in distances],
             "settled_by": self.settled_by,
@@ -134,12 +132,10 @@ def planned_limits(
     start = SOFTENED_POWER_LAW.coordinates({"b_px": SCATTER.b_px, "c": SCATTER.c, "total": SCATTER.total})
     solution = invert(transit, start=start, near=True, threads=threads, progress=progress)
     model, _ = linear_model_of(View(solution), library, seed=seed, progress=progress)
-    model = _without_measured(model)
-    effects, calibration = model.evidence.effects, shipped_calibration()
-    threshold, temperature = calibration.threshold(), calibration.temperature
+    effects = model.evidence.effects
     return Planned(
         plan,
-        limits(model, threshold=threshold, temperature=temperature, observed=False),
+        limits(ClosedForm(model), observed=False),
         tuple(effect.name for effect in effects if effect.held is not None),
         {effect.name: effect.settled_by for effect in effects},
         dict(solution.inversion.left_out),
@@ -164,12 +160,3 @@ def _noise_free(plan: Plan, diffraction: Kernel, seed: int, threads: int) -> Tra
         for n, (frame, factor) in enumerate(zip(transit.frames, brightness, strict=True))
     )
     return replace(transit, frames=frames)
-
-
-def _without_measured(model: LinearModel) -> LinearModel:
-    """Remove the effects whose form is measured in the images, because a plan has no images yet."""
-    evidence = model.evidence
-    measured = {e.name for e in evidence.effects if evidence.numbers_of(evidence.columns[e.name])}
-    effects = tuple(effect for effect in evidence.effects if effect.name not in measured)
-    untestable = evidence.untestable | dict.fromkeys(sorted(measured), MEASURED)
-    return replace(model, evidence=replace(evidence, effects=effects, untestable=untestable))

@@ -39,8 +39,6 @@ from service.cli.progress import echo
 from service.client.operations import Operations
 from workers.contract.requests import GapDiagnose, Report
 
-SHOWN = 3
-UNKNOWN = "unknown"
 THREADS = 2  # of a plan
 # The diagnosis runs as a command in another process, which does not know the withheld effects.
 DIAGNOSE = (
@@ -54,8 +52,8 @@ DIAGNOSE = (
     "{report}",
     "--local",
 )
-# The ideal observer also runs in another process, because the blind set and the gap library share no code.
-IDEAL = (sys.executable, "-P", "-m", "psfcore.gap.ideal_observer", "{expected}", "{ideal}")
+# The bound is also computed in another process, because the blind set and the gap library share no code.
+BOUND = (sys.executable, "-P", "-m", "psfcore.gap.bound", "{expected}", "{bound}")
 
 
 @contextmanager
@@ -165,7 +163,7 @@ def gap() -> None:
     "--corrected",
     "corrected_file",
     type=OUTPUT,
-    help="Write the corrected PSF (FITS): the PSF fitted with the answer in the model; for a tie, with the best effect",
+    help="Write the corrected PSF (FITS): the PSF fitted with the named effects in the model; for a tie, with the best one",
 )
 @click.option(
     "--effects",
@@ -232,47 +230,19 @@ def _next_step(report: dict[str, Any], transit: str, page: Path | None, correcte
         return f"`heliopsf gap {transit} --corrected PSF.fits` writes the PSF without the effect"
     if report["verdict"] in ("inconclusive", "tie"):
         return "`heliopsf gap plan PLAN` tells whether images that are not taken yet would decide"
-    if report["verdict"] == "unknown":
+    if any(cause["field"] for cause in report["causes"]):
         where = "-o PAGE.html writes a page with" if page is None else f"{page} has"
-        return f"{where} the map or the curve of the unknown cause"
+        return f"{where} the map or the curve of the change"
     return ""
 
 
 def _lines(report: dict[str, Any]) -> list[str]:
-    """The answer of the report as lines to print. The JSON and the page have all effects."""
-    so_far = "most probable: " if report["verdict"] == "inconclusive" else ""
-    answer = f" ({so_far}{', '.join(report['answer'])})" if report["answer"] else ""
-    out = [report["sentence"], f"verdict: {report['verdict']}{answer}"]
-    in_set = {" + ".join(names) for names in report["set"]["members"]}
-    # The fields of an unknown cause follow as their own lines.
-    named = [one for one in (*report["together"], *report["effects"]) if one["name"] in in_set - {UNKNOWN}]
-    for effect in named[:SHOWN]:
-        closure = effect["closure"]
-        closed = "" if closure is None else f", held-out closure {100 * closure['value']:.0f} %"
-        numbers = ", ".join(
-            f"{name} {p['value']:.3g} ± {p['sigma']:.2g} {p['unit']}".strip()
-            for name, p in effect["parameters"].items()
-            if not name.rpartition(".")[2].startswith("bump_")
-        )
-        found = f"P = {effect['probability']:.2f}{closed}"
-        out.append(f"  {effect['name']:<24} {found}{': ' if numbers else ''}{numbers}")
-    if report["verdict"] != "none":
-        out += [f"  looks like: {_field(one)}" for one in report["unknown"]["fields"]]
+    """The answer of the report as lines to print: where, which, how far; then the verdict, what could not be tested, and cautions."""
+    answer = f" ({', '.join(report['answer'])})" if report["answer"] else ""
+    out = [*report["lines"], f"verdict: {report['verdict']}{answer}"]
     if report["untestable"]:
         out.append(f"  not testable: {', '.join(one['name'] for one in report['untestable'])}")
     return out + [f"  caution: {caution}" for caution in report["cautions"]]
-
-
-def _field(field: dict[str, Any]) -> str:
-    """A field of an unknown cause as text."""
-    beside = "".join(f", beside {name}" for name in field["beside"])
-    said = f"{field['words']}{beside} (P = {field['probability']:.2f})"
-    if field["strength"] is not None:
-        value, sigma = field["strength"]["value"], field["strength"]["sigma"]
-        said += f": {value:.3g} ± {sigma:.2g} {field['unit']}".rstrip()
-    if field["closure"] is not None:
-        said += f", held-out closure {100 * field['closure']['value']:.0f} %"
-    return said
 
 
 # --- blind cases ----------------------------------------------------------------------------------------
@@ -302,13 +272,6 @@ def _field(field: dict[str, Any]) -> str:
     help="Residual in the discs, percent, that remains when the PSF is fitted to images with the effect; repeat to vary it "
     "[default: random, 0.5 to 10]",
 )
-@click.option(
-    "--simulator",
-    default="",
-    show_default=False,
-    metavar="FILE.py|MODULE",
-    help="Let the function make_case of this file or module make the cases; its code is executed (docs/gap.md)",
-)
 @click.option("--clean-only", is_flag=True, help="Make only cases without an effect, to count false alarms")
 @click.option(
     "--synthetic",
@@ -329,7 +292,6 @@ def blind(
     scenes: tuple[Path, ...],
     only: tuple[str, ...],
     left_pct: tuple[float, ...],
-    simulator: str,
     clean_only: bool,
     synthetic: bool,
     make_only: bool,
@@ -347,13 +309,8 @@ def blind(
 
     if clean_only and only:
         raise click.UsageError("expected one of --clean-only and --only; got both")
-    if simulator and (only or clean_only or synthetic or left_pct or scenes):
-        raise click.UsageError(
-            "expected --simulator without --only, --left, --scenes, --clean-only and --synthetic, because the simulator "
-            "chooses its cases; got one of them"
-        )
     with user_errors(), alone_in(output):
-        plan = SetPlan(cases, seed, size, images, 0, only, clean_only, not synthetic, left_pct, simulator)
+        plan = SetPlan(cases, seed, size, images, 0, only, clean_only, not synthetic, left_pct)
         planes = [image_rate(file, limits()) for file in scenes]
         made, not_made = make_set(output, plan, scenes=planes, processes=processes, progress=say)
         numbers = [number for number in plan.numbers if number not in not_made]
@@ -365,7 +322,7 @@ def blind(
         if make_only:
             echo(f"{output}: {len(numbers)} of {cases} cases made and sealed")
             return
-        run_set(made, numbers, DIAGNOSE, ideal=IDEAL, processes=processes, keep=keep, progress=say)
+        run_set(made, numbers, DIAGNOSE, bound=BOUND, processes=processes, keep=keep, progress=say)
         echo(write_score(made, numbers, not_made))
 
 

@@ -93,7 +93,7 @@ def diagnosis_of(
     )
     provenance = _provenance(request, parent, added, means.job_id)
     corrected = None
-    if request.correct and found.correctable:
+    if request.correct and found.corrected is not None:
         try:
             corrected = _corrected(found, provenance)
         except DataError as error:
@@ -105,7 +105,7 @@ def diagnosis_of(
     report = Finished(
         said,
         {
-            **{name: said[name] for name in ("sentence", "verdict", "answer", "gap", "cautions")},
+            **{name: said[name] for name in ("sentence", "lines", "verdict", "answer", "gap", "cautions")},
             "strongest_axis": said["where"][0]["axis"],
             "psf_id": request.psf_id,
             "corrected_psf_id": corrected_id,

@@ -4,6 +4,17 @@
 
 Each kind of effect is a function that changes one step; `declare` adds it to the table EFFECTS. The docstring of the
 function states the physical cause. An effect of strength 0 changes nothing.
+
+| step | arguments of its functions after the effect |
+|---|---|
+| scene | the fine scene [y, x], DN/s; moment |
+| covered | the fraction of each fine pixel around the disc that the occulter covers; these pixels (`Behind`); moment |
+| foreground | the fine scene with its occulter [y, x], DN/s; moment |
+| optics | the telescope; moment |
+| spread | the fine light in the focal plane [y, x], DN/s; the fine scene with its occulter; the telescope; moment |
+| light | the fine light in the focal plane [y, x], DN/s; moment |
+| expected | the light on detector pixels [y, x], DN/s, before photon noise; moment |
+| read_out | one exposure [y, x], in DN with noise; moment; the images that were read before |
 """
 
 from __future__ import annotations
@@ -23,31 +34,26 @@ Function = TypeVar("Function", bound=Change)
 # How a parameter is drawn: a function, or the ends of the interval of a uniform distribution.
 Draw = Callable[[Plan, np.random.Generator], Any] | tuple[float, float]
 
-# Groups: effects that the gap library also contains, by the same names; effects that it lacks, for its calibration and for tests.
+# Groups: effects that the gap library also contains, by the same names; effects that it lacks, for its calibration
+# and for tests.
 KNOWN, CALIBRATION, TEST = "known", "calibration", "test"
-# For each step: the arguments of its functions after the effect, and the stage to which it belongs.
-#   scene: the fine scene [y, x], DN/s; moment
-#   covered: the fraction of each fine pixel around the disc that the occulter covers; these pixels (`Behind`); moment
-#   foreground: the fine scene with its occulter [y, x], DN/s; moment
-#   optics: the telescope; moment
-#   spread: the fine light [y, x], DN/s, if the PSF varies across the field; the fine scene with its occulter; telescope; moment
-#   light: the fine light in the focal plane [y, x], DN/s; moment
-#   expected: the light on detector pixels [y, x], DN/s, before photon noise; moment
-#   read_out: one exposure [y, x], in DN with noise; moment; the images that were read before
-STAGES = {
-    "scene": "scene",
-    "covered": "scene",
-    "foreground": "scene",
-    "optics": "optics",
-    "spread": "optics",
-    "light": "detector",
-    "expected": "detector",
-    "read_out": "detector",
+# The families of causes, by stage. A family is an operator and how it varies: "light_time" is added light that
+# changes with time, "offset" DN of each readout, "gain_kind" a gain that differs between gain modes or exposure
+# times, "psf_place" a PSF that changes over the field, "edge" light at the edge of the occulter, "edge_time" light in
+# front of the occulter that changes with time.
+_PLACE_OR_TIME = ("place", "time", "place_time")
+_FAMILIES = {
+    "scene": ("edge", "edge_time", "outside", "light_pointing", "sun"),
+    "optics": ("psf", *(f"psf_{how}" for how in _PLACE_OR_TIME), "core", "ghost"),
+    "detector": (
+        *(f"{operator}_{how}" for operator in ("light", "offset", "gain") for how in _PLACE_OR_TIME),
+        *("gain_kind", "response", "memory"),
+    ),
 }
+STAGES = {family: stage for stage, families in _FAMILIES.items() for family in families}
 ANGLE = (0.0, 360.0)  # degrees
 # Options of kinds (`Kind`).
 ADDS_LIGHT, DEPENDS_ON_NOISE, VARIES = {"adds_light": True}, {"noise_realisations": 12}, {"varies": True}
-IN_TIME = {"in_time": True}
 
 
 @dataclass(frozen=True)
@@ -79,20 +85,23 @@ class Earlier:
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of effect: the function `change` changes the step `step` of the simulation (a key of STAGES).
+    """A kind of effect: the function `change` changes a step of the simulation.
 
-    group: one of KNOWN, CALIBRATION, TEST. unit: the unit of the strength. nominal: a strength whose change is visible
-    in the discs. largest: the largest plausible strength. draw: how each parameter is drawn. power: the residual that
-    the effect leaves is proportional to strength**power. varies: whether its optics differ from image to image.
-    noise_realisations: number of noise realisations over which its change is averaged; 0 if the change does not depend
-    on noise. adds_light: whether it adds light at places of the detector that stay the same; the truth then has a map
-    of this light. in_time: whether it grows or fades during the transit. saturation_dn: the level in DN at which high-only images clip, from the effect, all exposures and the
-    plan.
+    group: one of KNOWN, CALIBRATION, TEST. families: the families of causes that are a right answer, the main one
+    first. unit: the unit of the strength. nominal: a strength whose change is visible in the discs. largest: the
+    largest plausible strength. draw: how each parameter is drawn. power: the residual that the effect leaves is
+    proportional to strength**power. varies: whether its optics differ from image to image. noise_realisations: number
+    of noise realisations over which its change is averaged; 0 if the change does not depend on noise. adds_light:
+    whether it adds light at places of the detector that stay the same; the truth then has a map of this light.
+    form_of: the effect of the gap library of which this withheld effect is another form. also: effects of the library
+    that it brings along, so that it is not wrong to name them. saturation_dn: the level in DN at which high-only
+    images clip, from the effect, all exposures and the plan.
     """
 
     name: str
     group: str
     step: str
+    families: tuple[str, ...]
     unit: str
     nominal: float
     largest: float
@@ -102,7 +111,8 @@ class Kind:
     varies: bool = False
     noise_realisations: int = 0
     adds_light: bool = False
-    in_time: bool = False
+    form_of: str | None = None
+    also: tuple[str, ...] = ()
     saturation_dn: Callable[[Effect, list[Plane], Plan], float] | None = None
 
     def drawn(self, plan: Plan, rng: np.random.Generator) -> Effect:
@@ -120,17 +130,21 @@ EFFECTS: dict[str, Kind] = {}
 def declare(
     group: str,
     step: str,
+    families: tuple[str, ...],
     unit: str,
     nominal: float,
     largest: float,
     options: Mapping[str, Any] | None = None,
     **draw: Draw,
 ) -> Callable[[Function], Function]:
-    """Add the decorated function to EFFECTS, under its own name. options: further fields of `Kind`. draw: its parameters."""
+    """Add the decorated function to EFFECTS, under its own name. options: further fields of `Kind`. draw: its
+    parameters."""
 
     def add(change: Function) -> Function:
         name = change.__name__
-        EFFECTS[name] = Kind(name, group, step, unit, nominal, largest, change, draw, **(options or {}))
+        EFFECTS[name] = Kind(
+            name, group, step, families, unit, nominal, largest, change, draw, **(options or {})
+        )
         return change
 
     return add
@@ -153,32 +167,38 @@ class Effect:
         return replace(self, strength=strength)
 
     def as_json(self) -> dict[str, Any]:
-        """Name, stage, strength, unit and parameters of the effect, as JSON."""
+        """The effect for the truth of a case. cause: its name in the gap library; None if the library does not
+        contain it."""
+        kind = self.kind
         return {
-            "name": self.kind.name,
-            "stage": STAGES[self.kind.step],
-            "in_time": self.kind.in_time,
+            "name": kind.name,
+            "cause": kind.name if kind.group == KNOWN else kind.form_of,
+            "families": list(kind.families),
+            "stage": STAGES[kind.families[0]],
+            "also": list(kind.also),
             "strength": self.strength,
-            "unit": self.kind.unit,
+            "unit": kind.unit,
             "parameters": dict(self.parameters),
         }
 
 
 def apply_effects(effects: Sequence[Effect], step: str, value: Any, *beside: Any) -> Any:
-    """The value after a step of the simulation: every effect that acts on this step changes it. step: a key of STAGES."""
+    """The value after a step of the simulation: every effect that acts on this step changes it."""
     for effect in effects:
         if effect.kind.step == step and effect.strength:
             value = effect.kind.change(effect, value, *beside)
     return value
 
 
-def unit_coordinates(shape: tuple[int, ...], angle_deg: float = 0.0) -> tuple[Plane, Plane]:
-    """Coordinates of the pixels [y, x] along and across a direction, in widths of the field, from its centre.
+def unit_coordinates(
+    shape: tuple[int, ...], angle_deg: float = 0.0, at: tuple[float, float] = (0.5, 0.5)
+) -> tuple[Plane, Plane]:
+    """Coordinates of the pixels [y, x] along and across a direction, in widths of the field, from a point.
 
-    angle_deg: the direction, from +x towards +y.
+    angle_deg: the direction, from +x towards +y. at: the point (x, y), fractions of the field.
     """
     ny, nx = shape
-    u, v = (np.arange(nx)[None, :] + 0.5) / nx - 0.5, (np.arange(ny)[:, None] + 0.5) / ny - 0.5
+    u, v = (np.arange(nx)[None, :] + 0.5) / nx - at[0], (np.arange(ny)[:, None] + 0.5) / ny - at[1]
     cos, sin = direction(angle_deg)
     return u * cos + v * sin, v * cos - u * sin
 
@@ -204,7 +224,8 @@ def seed(plan: Plan, rng: np.random.Generator) -> int:
 
 
 def near_a_disc(spread: float) -> Callable[[Plan, np.random.Generator], tuple[float, float]]:
-    """Draws a point (x, y), fractions of the field, near a random position of the occulter. spread: rms distance per axis."""
+    """Draws a point (x, y), fractions of the field, near a random position of the occulter. spread: rms distance per
+    axis."""
 
     def draw(plan: Plan, rng: np.random.Generator) -> tuple[float, float]:
         shot = plan.shots[int(rng.integers(len(plan.shots)))]

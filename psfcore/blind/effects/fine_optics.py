@@ -4,10 +4,10 @@
     s_fine(r) = a / FINE^2 / (b + r)^c          for r > 0                                                Eq. (2)
 
 k is the fine kernel, and K is the kernel on detector pixels: the fraction of the light of a uniformly bright detector
-pixel that reaches another detector pixel at the offset o. In Eq. (1), s are the fine pixels of the source pixel, and t
-the fine pixels of the target pixel. s_fine is the fine scatter kernel. Its central pixel is set so that the central pixel
-of the binned kernel is 1 - total. The binned scatter then follows the power law on detector pixels, except for the
-curvature of the law within a pixel.
+pixel that reaches another detector pixel at the offset o. In Eq. (1), s are the fine pixels of the source pixel, and
+t the fine pixels of the target pixel. s_fine is the fine scatter kernel. Its central pixel is set so that the central
+pixel of the binned kernel is 1 - total. The binned scatter then follows the power law on detector pixels, except for
+the curvature of the law within a pixel.
 
 The simulation bins the light only at the detector.
 
@@ -48,10 +48,11 @@ _LARGEST_BUILT_PX = 2048
 class Glass:
     """The known part of the PSF: the diffraction by a pupil and the orders of a mesh. Its sum is 1.
 
-    kind: SYNTHETIC, or the name of an instrument whose mount and meshes are built. size_px: size of the array in detector
-    pixels. The other fields describe a synthetic pattern. core_px, wing_px: the exponential scales of its core and of
-    its wing; the core is far narrower than a pixel, as in a real telescope at this wavelength. wing_share, arm_share:
-    the fractions of the light in the wing and in the orders of the mesh. pitch_px: the spacing of the orders.
+    kind: SYNTHETIC, or the name of an instrument whose mount and meshes are built. size_px: size of the array in
+    detector pixels. The other fields describe a synthetic pattern. core_px, wing_px: the exponential scales of its
+    core and of its wing; the core is far narrower than a pixel, as in a real telescope at this wavelength.
+    wing_share, arm_share: the fractions of the light in the wing and in the orders of the mesh. pitch_px: the spacing
+    of the orders.
     """
 
     kind: str
@@ -63,7 +64,8 @@ class Glass:
     pitch_px: float = 5.7
 
     def fine(self, turn_deg: float = 0.0, pitch_factor: float = 1.0) -> Kernel:
-        """The fine kernel [y, x], sum 1, with the mesh rotated by turn_deg and its order spacing multiplied by pitch_factor."""
+        """The fine kernel [y, x], sum 1, with the mesh rotated by turn_deg and its order spacing multiplied by
+        pitch_factor."""
         size = FINE * self.size_px
         if self.kind == SYNTHETIC:
             kernel = self._drawn(size, turn_deg, pitch_factor)
@@ -92,7 +94,8 @@ class Glass:
 
 
 def _built(name: str, size: int, turn_deg: float, pitch_factor: float) -> Kernel:
-    """The convolved patterns of mount, entrance mesh and filter-wheel mesh of an instrument, with a changed entrance mesh.
+    """The convolved patterns of mount, entrance mesh and filter-wheel mesh of an instrument, with a changed entrance
+    mesh.
 
     The pattern of the entrance mesh is computed separately, so that only this mesh is rotated. This pattern already
     contains the blur by the pupil; the convolution adds this blur a second time. The known PSF of the case contains the
@@ -133,7 +136,8 @@ def _pupil(name: str, size: int) -> Kernel:
 
 @dataclass(frozen=True, eq=False)
 class FineOptics:
-    """A telescope: its scatter kernel and its diffraction PSF on fine pixels [y, x], each with the centre at [n // 2, n // 2].
+    """A telescope: its scatter kernel and its diffraction PSF on fine pixels [y, x], each with the centre at [n // 2,
+    n // 2].
 
     law, glass: the parameters of the two kernels; effects use them to compute changed kernels.
     """
@@ -156,7 +160,8 @@ class FineOptics:
 
     @cached_property
     def more_scatter(self) -> Convolver:
-        """The convolution with the change of the PSF if the scatter is doubled: light moves from the core to the wings."""
+        """The convolution with the change of the PSF if the scatter is doubled: light moves from the core to the
+        wings."""
         moved, middle = self.scatter.copy(), self.scatter.shape[0] // 2
         moved[middle, middle] = 0.0
         moved[middle, middle] = self.scatter[middle, middle] - 1  # minus all scattered light, at any distance
@@ -197,7 +202,8 @@ def scaled_scatter(falloff: Kernel, law: ScatterTruth, amplitude: float) -> Kern
 
 
 def binned_kernel(fine: Kernel) -> Kernel:
-    """Eq. (1): bin a fine kernel [y, x] of even size to detector pixels. Light is lost only at the edges of the array."""
+    """Eq. (1): bin a fine kernel [y, x] of even size to detector pixels. Light is lost only at the edges of the
+    array."""
     columns = convolve1d(fine, _TRIANGLE, axis=1, mode="constant")[:, ::FINE]
     return np.asarray(convolve1d(columns, _TRIANGLE, axis=0, mode="constant")[::FINE])
 

@@ -12,7 +12,6 @@ from scipy.ndimage import affine_transform, gaussian_filter
 from psfcore.blind.effects.effect import (
     ANGLE,
     CALIBRATION,
-    IN_TIME,
     KNOWN,
     VARIES,
     Effect,
@@ -31,9 +30,10 @@ _HALF_TURN = (0.0, 180.0)
 _FINER = 9  # number of samples in a fine pixel along each axis
 
 
-@declare(KNOWN, "optics", "stretch", 0.1, 0.6, angle_deg=_HALF_TURN)
+@declare(KNOWN, "optics", ("psf",), "stretch", 0.1, 0.6, angle_deg=_HALF_TURN)
 def anisotropic_scatter(effect: Effect, optics: FineOptics, moment: Moment) -> FineOptics:
-    """The mirrors were polished along one direction: scatter is stretched. The stretch grows with the distance r as r / (r + b)."""
+    """The mirrors were polished along one direction: scatter is stretched. The stretch grows with the distance r as r
+    / (r + b)."""
     law = optics.law
     along, across = turned_offsets(optics, effect["angle_deg"])
     r = np.hypot(along, across)
@@ -42,9 +42,10 @@ def anisotropic_scatter(effect: Effect, optics: FineOptics, moment: Moment) -> F
     return rescaled(optics, falloff, (law.b_px + r) ** -law.c)
 
 
-@declare(CALIBRATION, "optics", "share", 0.2, 0.95, angle_deg=ANGLE, reach_px=(15.0, 80.0))
+@declare(CALIBRATION, "optics", ("psf",), "share", 0.2, 0.95, angle_deg=ANGLE, reach_px=(15.0, 80.0))
 def one_sided_scatter(effect: Effect, optics: FineOptics, moment: Moment) -> FineOptics:
-    """A mirror is tilted or contaminated on one side: scatter is stronger there, similar to coma, up to a few tens of pixels."""
+    """A mirror is tilted or contaminated on one side: scatter is stronger there, similar to coma, up to a few tens of
+    pixels."""
     along, across = turned_offsets(optics, effect["angle_deg"])
     r = np.hypot(along, across)
     isotropic = (optics.law.b_px + r) ** -optics.law.c
@@ -53,12 +54,13 @@ def one_sided_scatter(effect: Effect, optics: FineOptics, moment: Moment) -> Fin
 
 
 def rescaled(optics: FineOptics, falloff: Plane, before: Plane) -> FineOptics:
-    """The telescope with another falloff of the scatter; the total of the scatter stays the same. before: the old falloff."""
+    """The telescope with another falloff of the scatter; the total of the scatter stays the same. before: the old
+    falloff."""
     amplitude = optics.law.a / FINE**2 * float(before.sum() / falloff.sum())
     return dataclasses.replace(optics, scatter=scaled_scatter(falloff, optics.law, amplitude))
 
 
-@declare(KNOWN, "optics", "share of light", 0.02, 0.3, scale=(0.15, 0.5), moffat=coin)
+@declare(KNOWN, "optics", ("psf",), "share of light", 0.02, 0.3, scale=(0.15, 0.5), moffat=coin)
 def wide_halo(effect: Effect, optics: FineOptics, moment: Moment) -> FineOptics:
     """Particles or a second surface scatter a fraction of the light into an exponential or Moffat halo.
 
@@ -74,16 +76,18 @@ def wide_halo(effect: Effect, optics: FineOptics, moment: Moment) -> FineOptics:
     return dataclasses.replace(optics, scatter=scatter)
 
 
-@declare(KNOWN, "optics", "px", 1.0, 3.0, {"power": 1.5}, angle_deg=_HALF_TURN, jitter=coin)
+@declare(KNOWN, "optics", ("core",), "px", 1.0, 3.0, {"power": 1.5}, angle_deg=_HALF_TURN, jitter=coin)
 def core_blur(effect: Effect, optics: FineOptics, moment: Moment) -> FineOptics:
-    """A Moffat profile blurs the core (defocus, figure errors), or a motion spreads it along a straight line (jitter)."""
+    """A Moffat profile blurs the core (defocus, figure errors), or a motion spreads it along a straight line
+    (jitter)."""
     width = effect.strength
     return _blurred(optics, _line(width, effect["angle_deg"]) if effect["jitter"] else _moffat(width))
 
 
-@declare(CALIBRATION, "optics", "px at the end", 2.0, 8.0, VARIES | IN_TIME | {"power": 1.5})
+@declare(CALIBRATION, "optics", ("psf_time", "core"), "px at the end", 2.0, 8.0, VARIES | {"power": 1.5})
 def focus_drift(effect: Effect, optics: FineOptics, moment: Moment) -> FineOptics:
-    """The telescope's structure warms: blur by a uniform disc, whose diameter grows from 0 to the strength at the last image."""
+    """The telescope's structure warms: blur by a uniform disc, whose diameter grows from 0 to the strength at the
+    last image."""
     diameter = effect.strength * moment.elapsed
     return optics if diameter == 0 else _blurred(optics, _pillbox(diameter))
 
@@ -110,11 +114,10 @@ def _moffat(width_px: float) -> Plane:
 
 def _pillbox(diameter_px: float) -> Plane:
     """A kernel that is a uniform disc; its edge is half a sample wide."""
-
-    def inside(x: Plane, y: Plane) -> Plane:
-        return np.clip((diameter_px / 2 - np.hypot(x, y)) * _FINER * FINE + 0.5, 0.0, 1.0)
-
-    return _sampled(diameter_px / 2 + 0.5, inside)
+    radius_px, slope = diameter_px / 2, _FINER * FINE
+    return _sampled(
+        radius_px + 0.5, lambda x, y: np.clip((radius_px - np.hypot(x, y)) * slope + 0.5, 0.0, 1.0)
+    )
 
 
 def _line(length_px: float, angle_deg: float) -> Plane:
@@ -128,28 +131,29 @@ def _line(length_px: float, angle_deg: float) -> Plane:
     return _sampled(length_px / 2 + 1, near)
 
 
-@declare(KNOWN, "optics", "share of the spacing", 0.05, 0.3, sign=sign)
+@declare(KNOWN, "optics", ("psf",), "share of the spacing", 0.05, 0.3, sign=sign)
 def mesh_pitch(effect: Effect, optics: FineOptics, moment: Moment) -> FineOptics:
-    """The pitch of the mesh, or the wavelength, differs: the distances of the mesh orders are larger, or smaller, than assumed."""
+    """The pitch of the mesh, or the wavelength, differs: the distances of the mesh orders are larger, or smaller,
+    than assumed."""
     kernel = optics.glass.fine(pitch_factor=1 + effect["sign"] * effect.strength)
     return dataclasses.replace(optics, diffraction=kernel)
 
 
-@declare(KNOWN, "optics", "degrees", 3.0, 20.0, sign=sign)
+@declare(KNOWN, "optics", ("psf",), "degrees", 3.0, 20.0, sign=sign)
 def mesh_rotation(effect: Effect, optics: FineOptics, moment: Moment) -> FineOptics:
     """The filter was mounted at another angle, so the mesh is rotated."""
     kernel = optics.glass.fine(turn_deg=effect["sign"] * effect.strength)
     return dataclasses.replace(optics, diffraction=kernel)
 
 
-@declare(KNOWN, "spread", "share of the scatter", 0.2, 0.8, angle_deg=ANGLE, bowl=(-0.6, 0.6))
+@declare(KNOWN, "spread", ("psf_place",), "share of the scatter", 0.2, 0.8, angle_deg=ANGLE, bowl=(-0.6, 0.6))
 def field_dependent_scatter(
     effect: Effect, seen: Plane, lit: Plane, optics: FineOptics, moment: Moment
 ) -> Plane:
     """Light from another field angle meets a rougher part of the mirrors.
 
-    The relative change of the total scatter is the sum of a linear and a quadratic term. The linear term is the strength
-    at the edge of the field.
+    The relative change of the total scatter is the sum of a linear and a quadratic term. The linear term is the
+    strength at the edge of the field.
     """
     along, across = unit_coordinates(lit.shape, effect["angle_deg"])
     more = effect.strength * (2 * along + effect["bowl"] * (4 * (along**2 + across**2) - 2 / 3))
@@ -159,6 +163,7 @@ def field_dependent_scatter(
 @declare(
     KNOWN,
     "light",
+    ("ghost",),
     "share of light",
     0.01,
     0.1,

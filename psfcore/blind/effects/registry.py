@@ -10,14 +10,12 @@ from psfcore.errors import DataError
 DECLARED_IN = (scene, optics, detector, withheld)
 
 
-def names_of(group: str) -> tuple[str, ...]:
-    """The names of the effects of a group."""
+def _names_of(group: str) -> tuple[str, ...]:
     return tuple(kind.name for kind in EFFECTS.values() if kind.group == group)
 
 
-KNOWN = names_of(effect.KNOWN)  # effects that the gap library also contains, by the same names
-WITHHELD = {group: names_of(group) for group in (effect.CALIBRATION, effect.TEST)}
-UNKNOWN = tuple(name for names in WITHHELD.values() for name in names)
+KNOWN = _names_of(effect.KNOWN)  # effects that the gap library also contains, by the same names
+WITHHELD = {group: _names_of(group) for group in (effect.CALIBRATION, effect.TEST)}
 
 
 def effect_named(name: str) -> Kind:

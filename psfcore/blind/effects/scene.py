@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, zoom
+from scipy.optimize import brentq
 
 from psfcore.blind.effects.effect import (
     ADDS_LIGHT,
@@ -28,7 +29,9 @@ from psfcore.transit.transit import Place
 Plane = NDArray[np.float64]
 
 
-@declare(KNOWN, "covered", "px/s", 0.4, 1.5, angle_deg=lambda plan, rng: float(rng.normal(3.0, 8.0)))
+@declare(
+    KNOWN, "covered", ("edge",), "px/s", 0.4, 1.5, angle_deg=lambda plan, rng: float(rng.normal(3.0, 8.0))
+)
 def occulter_motion(effect: Effect, share: Plane, around: Behind, moment: Moment) -> Plane:
     """The disc moves along a straight line during the exposure, in steps of at most a fifth of a pixel."""
     way = effect.strength * moment.shot.exposure_s
@@ -40,7 +43,7 @@ def occulter_motion(effect: Effect, share: Plane, around: Behind, moment: Moment
     return np.asarray(sum(covered_share(at, around.first, around.shape, FINE) for at in moved) / steps)
 
 
-@declare(KNOWN, "scene", "share, rms", 0.2, 0.6, seed=seed, patch=(0.02, 0.08), period=(0.15, 0.6))
+@declare(KNOWN, "scene", ("sun",), "share, rms", 0.2, 0.6, seed=seed, patch=(0.02, 0.08), period=(0.15, 0.6))
 def scene_evolution(effect: Effect, scene: Plane, moment: Moment) -> Plane:
     """Patches of the Sun brighten and fade with the same period, but with different phases."""
     phase = 2 * np.pi * moment.elapsed / effect["period"]
@@ -55,6 +58,7 @@ def scene_evolution(effect: Effect, scene: Plane, moment: Moment) -> Plane:
 @declare(
     KNOWN,
     "light",
+    ("outside",),
     "DN/s",
     400.0,
     4000.0,
@@ -67,9 +71,9 @@ def scene_evolution(effect: Effect, scene: Plane, moment: Moment) -> Plane:
 def out_of_field_light(effect: Effect, seen: Plane, moment: Moment) -> Plane:
     """In each pointing, a bright band beyond one edge of the field scatters light into the field.
 
-    The brightness of the band in a pointing is the strength times the entry of `levels`. The band is half as wide as the
-    field, and begins a twelfth of the field beyond the edge. edges: the edge of each pointing; 0 left, 1 right, 2 below, 3
-    above. b_px, c, a: parameters of the power law that scatters the light of the band.
+    The brightness of the band in a pointing is the strength times the entry of `levels`. The band is half as wide as
+    the field, and begins a twelfth of the field beyond the edge. edges: the edge of each pointing; 0 left, 1 right, 2
+    below, 3 above. b_px, c, a: parameters of the power law that scatters the light of the band.
     """
     pointing = moment.shot.pointing - 1
     band = _band(seen.shape[0], effect["edges"][pointing], effect["b_px"], effect["c"], effect["a"])
@@ -100,6 +104,7 @@ def _band(fine_size: int, edge: int, b_px: float, c: float, a: float) -> Plane:
 @declare(
     CALIBRATION,
     "light",
+    ("light_pointing",),
     "DN/s",
     1.0,
     60.0,
@@ -110,12 +115,12 @@ def _band(fine_size: int, edge: int, b_px: float, c: float, a: float) -> Plane:
     phase_deg=ANGLE,
 )
 def limb_glint(effect: Effect, seen: Plane, moment: Moment) -> Plane:
-    """In one pointing an edge of the baffle reflects sunlight: rays that spread from a point beyond the edge of the field."""
+    """In one pointing an edge of the baffle reflects sunlight: rays that spread from a point beyond the edge of the
+    field."""
     if moment.shot.pointing != effect["pointing"]:
         return seen
-    u, v = unit_coordinates(seen.shape)
     cos, sin = direction(effect["angle_deg"])
-    x, y = u - 0.8 * cos, v - 0.8 * sin
+    x, y = unit_coordinates(seen.shape, at=(0.5 + 0.8 * cos, 0.5 + 0.8 * sin))
     fan = np.cos(2 * effect["rays"] * np.arctan2(y, x) + np.deg2rad(effect["phase_deg"])) ** 2
     return seen + effect.strength * (0.2 + fan) * np.exp(-np.hypot(x, y) / 0.5) / np.exp(-1.6)
 
@@ -124,26 +129,25 @@ def _saturation_level(effect: Effect, exposures: list[Plane], plan: Plan) -> flo
     """The level at which high-only images clip."""
     high = [dn for dn, shot in zip(exposures, plan.shots, strict=True) if shot.gain_mode == HIGH]
     values = np.concatenate([np.maximum(dn, 0.0).ravel() for dn in high])
-    low, top = 0.0, float(values.max())
-    for _ in range(40):
-        level = (low + top) / 2
-        lost = float(np.maximum(values - level, 0.0).sum() / values.sum())
-        low, top = (level, top) if lost > effect.strength else (low, level)
-    return float(np.rint(top))
+    lost = effect.strength * values.sum()
+    level = brentq(lambda dn: np.maximum(values - dn, 0.0).sum() - lost, 0.0, values.max(), xtol=0.1)
+    return float(np.rint(level))
 
 
 @declare(
     KNOWN,
     "scene",
+    ("response",),
     "share of the light above the level",
     0.03,
     0.15,
-    {"saturation_dn": _saturation_level},
+    {"saturation_dn": _saturation_level, "also": ("scene_evolution",)},
     seed=seed,
     flicker=(0.15, 0.5),
 )
 def saturation_fill(effect: Effect, scene: Plane, moment: Moment) -> Plane:
-    """Clipped pixels are filled from another image, or stay clipped. The strength is the fraction of the light that is lost by clipping.
+    """Clipped pixels are filled from another image, or stay clipped. The strength is the fraction of the light that
+    is lost by clipping.
 
     The bright pixels that clip also flicker, so other images show other values in them.
     """
@@ -156,7 +160,8 @@ def saturation_fill(effect: Effect, scene: Plane, moment: Moment) -> Plane:
 
 @cache
 def patches(size: int, seed: int, patch: float) -> Plane:
-    """A smooth random plane [y, x] with mean 0 and rms 1. patch: the size of its patches, as a fraction of the field."""
+    """A smooth random plane [y, x] with mean 0 and rms 1. patch: the size of its patches, as a fraction of the
+    field."""
     rng = np.random.default_rng(seed)
     coarse = max(8, int(np.ceil(4 / patch)))
     drawn = gaussian_filter(rng.standard_normal((coarse, coarse)), 1.5)

@@ -31,7 +31,6 @@ Matrix = NDArray[np.float64]
 # Chi2 of the unocculted field may exceed its degrees of freedom by this fraction without a gap: the Sun always changes a little.
 UNOCCULTED_WIDTH = 0.03
 DEGREES = 4  # number of polynomials in time of the patterns: degrees 0 to 3
-COST_OF_NUMBERS = 2.0  # a change that was measured in the blocks must gain this much for each measured number
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,9 +62,8 @@ def label_of(names: Sequence[str]) -> str:
 def fit_effects(model: LinearModel, effects: Sequence[Effect], *, any_sign: bool = False) -> EffectFit:
     """Fit the coordinates of the PSF together with these effects.
 
-    A parameter that must be positive is left out if its fitted value is not positive. A parameter whose change was measured
-    in the unocculted field is left out if its gain is smaller than the cost of the measured numbers. any_sign: keep all
-    parameters, whatever their sign and gain.
+    A parameter that must be positive is left out if its fitted value is not positive. any_sign: keep all parameters,
+    whatever their sign.
     """
     columns = {
         column: (effect, parameter)
@@ -76,17 +74,14 @@ def fit_effects(model: LinearModel, effects: Sequence[Effect], *, any_sign: bool
     step = model.fit(tuple(columns))
     base = len(model.evidence.base)
     while not any_sign:
-        out = _not_worth_its_numbers(model, step)
-        if out is None:
-            below = {
-                column: float(value)
-                for column, value in zip(step.columns[base:], step.values[base:], strict=True)
-                if columns[column][1].positive and value <= 0
-            }
-            out = min(below, key=lambda column: below[column], default=None)
-        if out is None:
+        below = {
+            column: float(value)
+            for column, value in zip(step.columns[base:], step.values[base:], strict=True)
+            if columns[column][1].positive and value <= 0
+        }
+        if not below:
             break
-        del columns[out]
+        del columns[min(below, key=lambda column: below[column])]
         step = model.fit(tuple(columns))
     sigma = np.sqrt(np.maximum(np.diag(step.covariance), 0.0))
     values = {}
@@ -112,25 +107,12 @@ def _p_value(model: LinearModel, columns: Sequence[int], gain: float, trials: fl
     """
     learned = model.learned(columns)
     shares = learned / (1 + learned)
-    free = len(columns) - learned.size + model.evidence.numbers_of(columns)
+    free = len(columns) - learned.size
     mean, half_variance = free + float(shares.sum()), free + float((shares**2).sum())
     if half_variance <= 0:
         return 1.0
     scale = mean / half_variance
     return min(1.0, trials * float(chdtrc(mean * scale, gain * scale)))
-
-
-def _not_worth_its_numbers(model: LinearModel, step: Step) -> int | None:
-    """Of the columns whose gain is smaller than the cost of their measured numbers, the one with the smallest gain; None if
-    there is no such column."""
-    columns = step.columns[len(model.evidence.base) :]
-    gains = {}
-    for column in columns:
-        numbers = model.evidence.numbers_of([column])
-        gain = step.fall - model.fit([c for c in columns if c != column]).fall if numbers else 0.0
-        if numbers and gain < COST_OF_NUMBERS * (1 + numbers):
-            gains[column] = gain
-    return min(gains, key=lambda column: gains[column], default=None)
 
 
 def p_value_of_gap(model: LinearModel) -> float:

@@ -67,13 +67,12 @@ class Prior:
     """The prior of the parameter of each column, a Gaussian (columns,). The coordinates of the PSF have no prior.
 
     likely: the largest plausible size; infinite for the coordinates of the PSF. positive: whether the parameter cannot be
-    negative. field: whether it is a coefficient of a random field. exact: whether its change has no template error.
+    negative. field: whether it is a coefficient of a random field.
     """
 
     likely: Vector
     positive: NDArray[np.bool_]
     field: NDArray[np.bool_]
-    exact: NDArray[np.bool_]
 
     def precision(self, columns: Sequence[int], scale: float | Vector = 1.0) -> Vector:
         """1 / variance for these columns. scale: the width of the Gaussian, in units of the likely size."""
@@ -87,7 +86,7 @@ class Evidence:
     effects: the effects that these data can show. columns: the columns of each effect, by its name. base: the columns that
     every fit contains. discs: the cells of each image that the fit used. image_info: the properties of every image,
     used or not. untestable: the reasons why effects cannot be tested, by name. longest_step: `Parameter.largest_step` of each
-    coordinate of the PSF. box_px: the edge of a box of `DiscCells.boxes`. kernel: the total PSF, summed over boxes. numbers: `Change.numbers` by column. templates: `Effect.distinguished` by effect.
+    coordinate of the PSF. box_px: the edge of a box of `DiscCells.boxes`. kernel: the total PSF, summed over boxes. templates: `Effect.distinguished` by effect.
     """
 
     effects: tuple[Effect, ...]
@@ -100,7 +99,6 @@ class Evidence:
     longest_step: Vector
     box_px: int
     kernel: Matrix
-    numbers: dict[int, int] = field(default_factory=dict)
     templates: dict[str, float] = field(default_factory=dict)
 
     def columns_of(self, effect: str) -> dict[str, int]:
@@ -117,17 +115,12 @@ class Evidence:
     def prior(self) -> Prior:
         """The prior of every column."""
         nothing = np.zeros(self.size, np.bool_)
-        found = Prior(np.full(self.size, np.inf), nothing, nothing.copy(), nothing.copy())
+        found = Prior(np.full(self.size, np.inf), nothing, nothing.copy())
         for effect in self.effects:
             for column, parameter in zip(self.columns[effect.name], effect.parameters, strict=False):
                 found.likely[column] = parameter.likely
                 found.positive[column], found.field[column] = parameter.positive, effect.field
-                found.exact[column] = effect.exact
         return found
-
-    def numbers_of(self, columns: Sequence[int]) -> int:
-        """The number of values that were measured in the unocculted field to compute the changes of these columns."""
-        return sum(self.numbers.get(column, 0) for column in columns)
 
     @cached_property
     def images(self) -> tuple[int, ...]:
@@ -204,7 +197,6 @@ def gather(
         box_px=box_px(solution.transit.shape),
         kernel=coarse_kernel(view.kernel, box_px(solution.transit.shape)),
         longest_step=np.array([parameter.largest_step for parameter in solution.inversion.shape.parameters]),
-        numbers={len(base) + k: change.numbers for k, change in enumerate(changes) if change.numbers},
         templates={
             effect.name: effect.distinguished(view) if effect.distinguished else float(effect.trials)
             for effect in library
@@ -240,14 +232,12 @@ def disc_with_jacobian(view: View, n: int, changes: Sequence[Change]) -> DiscCel
     flat = planes.reshape(planes.shape[0], -1)
     scene = view.occulted_scene(n)
     slopes = (slope.field(slope.convolve(scene)) for slope in view.slopes)
-    shown = [k for k, change in enumerate(changes) if change.disc]
-    fields = itertools.chain(slopes, (changes[k].change(n, view.expected) for k in shown))
-    rows = [*range(len(view.slopes)), *(len(view.slopes) + k for k in shown)]
+    fields = itertools.chain(slopes, (change.change(n, view.expected) for change in changes))
     jacobian = np.zeros((len(view.slopes) + len(changes), flat.shape[0]))
-    for first in range(0, len(rows), AT_ONCE):
+    for first in range(0, len(jacobian), AT_ONCE):
         # Several fields are processed together, so that the large planes of the cells are read from memory only once for them.
         some = np.array([np.ravel(one) for one in itertools.islice(fields, AT_ONCE)], dtype=flat.dtype)
-        jacobian[rows[first : first + AT_ONCE]] = some @ flat.T
+        jacobian[first : first + AT_ONCE] = some @ flat.T
     boxes = np.array([summed_over_boxes(planes), summed_over_boxes(planes * view.expected[n])])
     whole = solution.optics.field(scene)
     in_boxes = summed_over_boxes(whole[None])[0].astype(np.float64) / box_px(whole.shape) ** 2
@@ -276,7 +266,6 @@ def residuals_at(
         evidence,
         effects=(),
         columns={},
-        numbers={},
         untestable={},
         discs=tuple(_disc_at(view, disc, kept, changes) for disc in evidence.discs if disc.index in part),
         unocculted=unocculted,
@@ -338,6 +327,8 @@ def _testable(evidence: Evidence) -> Evidence:
     """Remove the effects that change neither a disc nor a block, and list them as untestable."""
     untestable, columns = dict(evidence.untestable), dict(evidence.columns)
     for name, here in evidence.columns.items():
+        if not here:  # the Sun has no template
+            continue
         cells = max(float(np.abs(disc.jacobian[list(here)]).max()) for disc in evidence.discs)
         if not (cells > 0 or np.abs(evidence.unocculted.errors[list(here)]).max() > 0):
             untestable[name] = "it changes no image of this transit"

@@ -11,7 +11,6 @@ from scipy.ndimage import distance_transform_edt
 
 from psfcore.gap.effect import Change, Effect
 from psfcore.gap.effect import EffectParameter as Parameter
-from psfcore.gap.evidence.unocculted_blocks import spread_blocks, unocculted_blocks
 from psfcore.gap.view import Field, View
 
 # Decay levels of losses, DN. Their sum approximates any loss that falls off smoothly with the counts, also that of charge traps.
@@ -107,8 +106,7 @@ def _persistence(view: View) -> Sequence[Change]:
 
 
 def _filled(view: View) -> Sequence[Change]:
-    """Errors of filled or clipped pixels. Three changes: a constant relative error, a relative error that grows
-    inwards, and `_flicker`.
+    """Errors of filled or clipped pixels. Two changes: a constant relative error, and a relative error that grows inwards.
 
     The second error is zero at the rim of a filled area and grows towards its middle, as for a clipped brightening.
     """
@@ -126,30 +124,7 @@ def _filled(view: View) -> Sequence[Change]:
         return np.asarray(images[n] * np.maximum(depth, 0.0), dtype=np.float32)
 
     # In the unocculted field, blocks with a filled pixel are not compared.
-    errors = [Change(partial(error, inside=inside), unocculted=False) for inside in (False, True)]
-    return [*errors, _flicker(view)]
-
-
-def _flicker(view: View) -> Change:
-    """The change of the Sun in the flickering blocks of the unocculted field. Pixels that are filled are bright, and bright pixels
-    often flicker, also those that are not filled.
-
-    The change is measured in the images: the difference from the mean of the pointing.
-    """
-    compared = unocculted_blocks(view, 0, lambda stage, step, steps: None)
-    flickers = (compared.flicker > 1) & compared.free
-    brightness, usual = (
-        np.where(compared.free, one, 0.0).sum(axis=1) for one in (compared.levels, compared.means)
-    )
-    levels = np.where(flickers, compared.levels / (brightness / np.maximum(usual, 1e-9))[:, None], 0.0)
-    numbers = 0
-    for pointing in np.unique(compared.pointing):
-        here = compared.pointing == pointing
-        images = flickers[here].sum(axis=0)
-        levels[here] -= np.where(flickers[here], levels[here].sum(axis=0) / np.maximum(images, 1), 0.0)
-        numbers += int(np.maximum(images - 1, 0).sum())  # the mean over the images is a part of the scene
-    shape = view.solution.transit.shape
-    return Change(lambda n, images: spread_blocks(levels[n], shape), disc=False, numbers=numbers)
+    return [Change(partial(error, inside=inside), unocculted=False) for inside in (False, True)]
 
 
 def _nothing_filled(view: View) -> str | None:
@@ -160,24 +135,24 @@ def _nothing_filled(view: View) -> str | None:
 EFFECTS: tuple[Effect, ...] = (
     Effect("dark_offset", "detector", (Parameter("offset", "DN", 2.0),),
            "The dark level subtracted from every readout is wrong.",
-           "a dark exposure, or a series of exposure times at one pointing", ("exposure", "intensity"), _dark_offset),
+           "a dark exposure, or a series of exposure times at one pointing", ("exposure", "intensity"), _dark_offset, family="offset_place"),
     Effect("intensity_gradient", "detector",
            (Parameter("level", "DN/s", 2.0), Parameter("slope_x", "DN/s/field", 2.0), Parameter("slope_y", "DN/s/field", 2.0)),
            "A light leak adds a faint plane to every image.", "an exposure with the door closed",
-           ("detector_x", "detector_y"), _gradient),
+           ("detector_x", "detector_y"), _gradient, family="light_place"),
     Effect("gain_mismatch", "detector", (Parameter("excess", "", 0.05),), "Combined-gain and high-gain images differ in their calibrated gain.",
-           "images of the same scene in both gain modes", ("gain_mode", "exposure"), _gain_mismatch, _one_gain_mode),
+           "images of the same scene in both gain modes", ("gain_mode", "exposure"), _gain_mismatch, _one_gain_mode, family="gain_kind"),
     Effect("nonlinearity", "detector", tuple(Parameter(f"loss_{level:g}_dn", "", 0.05) for level in FAINT_DN), "The detector reads faint signals too low.",
-           "a series of exposure times at one pointing", ("intensity",), _nonlinearity),
+           "a series of exposure times at one pointing", ("intensity",), _nonlinearity, family="response"),
     Effect("flat_field_residual", "detector", tuple(Parameter(f"cos_{kx}x_{ky}y", "", 0.02) for kx, ky in _half_waves()),
            "The flat field leaves a smooth error of the detector's sensitivity.", "images of the same scene at several positions on the detector",
-           ("detector_x", "detector_y"), _flat_field, field=True),
+           ("detector_x", "detector_y"), _flat_field, field=True, family="gain_place"),
     Effect("column_smear", "detector", (Parameter("share_below", "", 0.01, True), Parameter("share_above", "", 0.01, True)),
            "The readout smears charge along the columns.",
-           "an exposure with half of the field dark", ("detector_x", "detector_y", "intensity"), _column_smear),
+           "an exposure with half of the field dark", ("detector_x", "detector_y", "intensity"), _column_smear, family="memory"),
     Effect("persistence", "detector", (Parameter("share", "", 0.01, True), *(Parameter(f"share_fading_in_{waits}", "", 0.01, True) for waits in FADES_IN)),
            "A share of each image remains in the following images and decays.",
-           "a dark exposure after a bright one", ("time", "pointing"), _persistence),
-    Effect("saturation_fill", "detector", (Parameter("excess", "", 0.1), Parameter("excess_inside", "", 0.1), Parameter("flicker", "", 1.0, True)), "The values filled in for saturated pixels are wrong.",
-           "a shorter exposure at the same time", ("pointing", "intensity"), _filled, _nothing_filled),
+           "a dark exposure after a bright one", ("time", "pointing"), _persistence, family="memory"),
+    Effect("saturation_fill", "detector", (Parameter("excess", "", 0.1), Parameter("excess_inside", "", 0.1)), "The values filled in for saturated pixels are wrong.",
+           "a shorter exposure at the same time", ("pointing", "intensity"), _filled, _nothing_filled, family="response"),
 )  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -51,7 +52,8 @@ class _Best:
 
 def _searching(
     name: str,
-    parameter: Parameter,
+    family: str,
+    parameters: tuple[Parameter, ...],
     cause: str,
     settled_by: str,
     axes: tuple[str, ...],
@@ -79,7 +81,7 @@ def _searching(
     effect = Effect(
         name,
         "optics",
-        (parameter,),
+        parameters,
         cause,
         settled_by,
         axes,
@@ -87,6 +89,7 @@ def _searching(
         trials=trials,
         distinguished=lambda view: best(view).distinguished,
         held=held,
+        family=family,
     )
     return effect
 
@@ -114,10 +117,21 @@ def _ghost(view: View) -> _Best:
 
 
 def _copy(view: View, blur_px: float, dx: int, dy: int) -> Sequence[Change]:
-    def change(n: int, images: Sequence[Field]) -> Field:
+    """The copy, and how it changes if it is displaced further along x or y, magnified, or turned."""
+    x, y = view.places
+    ones = np.ones_like(x)
+    # The displacement along x and along y of each form.
+    forms = ((ones, 0 * ones), (0 * ones, ones), (x, y), (-y, x))
+
+    def copied(n: int, images: Sequence[Field]) -> Field:
         return np.asarray(displaced(gaussian_filter(images[n], blur_px), dx, dy), dtype=np.float32)
 
-    return [Change(change, unocculted=False)]
+    def moved(n: int, images: Sequence[Field], form: tuple[Field, Field]) -> Field:
+        along_y, along_x = np.gradient(copied(n, images))
+        return np.asarray(-(form[0] * along_x + form[1] * along_y), dtype=np.float32)
+
+    moves = [Change(partial(moved, form=form), unocculted=False) for form in forms]
+    return [Change(copied, unocculted=False), *moves]
 
 
 def _where_copied(copy: tuple[float, int, int]) -> str:
@@ -251,26 +265,27 @@ def _mesh(view: View, form: Callable[[Kernel, float], Kernel], amount: float) ->
 
 
 EFFECTS: tuple[Effect, ...] = (
-    _searching("ghost", Parameter("share", "", 0.02, True), "A reflection adds a displaced, defocused copy of the image.",
+    _searching("ghost", "ghost", (Parameter("share", "", 0.02, True), Parameter("shift_x", "px", 0.02), Parameter("shift_y", "px", 0.02),
+                                   Parameter("magnified", "px/field", 0.04), Parameter("turned", "px/field", 0.04)), "A reflection adds a displaced, defocused copy of the image.",
                "images of a bright source at several positions in the field", ("detector_x", "detector_y", "intensity"), GHOST_TRIALS,
                _ghost, lambda view, copy: _copy(view, *copy), _where_copied),
     Effect("anisotropic_scatter", "optics", (Parameter("p", "", 0.1), Parameter("q", "", 0.1)),
            "Scatter reaches farther along one direction. p and q are ln(1 + stretch) times the cosine and the sine of twice the angle of this direction.",
            "a transit along a second track that crosses the first", ("azimuth_in_disc", "detector_x", "detector_y"),
-           _anisotropic, _not_a_power_law),
+           _anisotropic, _not_a_power_law, family="psf"),
     Effect("field_dependent_scatter", "optics",
            (Parameter("x", "/field", 0.1), Parameter("y", "/field", 0.1), Parameter("outwards", "/field2", 0.2)),
            "The total scatter varies across the detector, linearly or from its centre outwards.", "a transit across another part of the detector",
-           ("detector_x", "detector_y"), _field_dependent, _not_a_power_law),
-    _searching("wide_halo", Parameter("share", "", 0.1, True), "The scatter has a second, wide component.",
+           ("detector_x", "detector_y"), _field_dependent, _not_a_power_law, family="psf_place"),
+    _searching("wide_halo", "psf", (Parameter("share", "", 0.1, True),), "The scatter has a second, wide component.",
                "an eclipse, or a transit of a larger occulter", ("scattering_distance", "pointing", "intensity"), len(HALOS), _halo, _as_halo),
-    _searching("core_blur", Parameter("variance", "px2", 1.0, True), "Jitter or defocus widens the core.",
+    _searching("core_blur", "core", (Parameter("variance", "px2", 1.0, True),), "Jitter or defocus widens the core.",
                "an image of a sharp limb or of a point source", ("radius_in_disc", "azimuth_in_disc"), len(BLURS),
                _core_blur, lambda view, blur: blur_as(view, *blur)),
-    _searching("mesh_rotation", Parameter("angle", "deg", 3.0), "The meshes are rotated relative to the detector.",
+    _searching("mesh_rotation", "psf", (Parameter("angle", "deg", 3.0),), "The meshes are rotated relative to the detector.",
                "the diffraction arms of a flare", ("azimuth_in_disc", "detector_x", "detector_y"), 2 * len(ANGLES_DEG),
                lambda view: _amount(view, _turned, ANGLES_DEG), lambda view, angle_deg: _mesh(view, _turned, angle_deg)),
-    _searching("mesh_pitch", Parameter("stretch", "%", 3.0), "The pitch of the meshes differs from its nominal value.",
+    _searching("mesh_pitch", "psf", (Parameter("stretch", "%", 3.0),), "The pitch of the meshes differs from its nominal value.",
                "the diffraction arms of a flare", ("radius_in_disc", "azimuth_in_disc"), 2 * len(PITCHES_PCT),
                lambda view: _amount(view, _stretched, PITCHES_PCT), lambda view, percent: _mesh(view, _stretched, percent)),
 )  # fmt: skip

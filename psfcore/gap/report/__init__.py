@@ -1,1 +1,1 @@
-"""The gap report: as JSON (schema gap/2), as an HTML page, and as figures."""
+"""The gap report: as JSON (schema gap/3), as an HTML page, and as figures."""

@@ -13,12 +13,13 @@ from typing import Any
 from psfcore.drawing.page import DASH, render, with_error
 from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.evidence.linear_model import FLOOR
+from psfcore.gap.evidence.tree import family_of
 from psfcore.gap.report import limits, plot
 from psfcore.gap.report import report as texts
 from psfcore.gap.report.report import (
     fits_of,
-    hypothesis_words,
     in_short_if_many,
+    label_words,
     p_words,
     percent_words,
     words,
@@ -30,11 +31,11 @@ Report = dict[str, Any]
 Row = list[str]
 
 VERDICTS = {
-    "none": "most probably there is no gap: noise and the error of the fit explain the residuals",
-    "attributed": "there is a gap, and the answer set contains one cause",
-    "tie": "there is a gap, and the answer set contains several effects or pairs of effects",
-    "unknown": "there is a gap, and the answer set contains no effect of the library",
-    "inconclusive": "the answer set contains different kinds of causes, for example an effect and an unknown cause",
+    "none": "no gap is detected: nothing is much more probable than noise and the error of the fit",
+    "attributed": "there is a gap, and each of its causes is sure",
+    "tie": "there is a gap, and these data cannot separate several effects that can cause it",
+    "unknown": "there is a gap, and its cause has a form that the library does not have",
+    "inconclusive": "the alternatives are of different kinds: effects of the library, and other forms",
 }
 MOST_HYPOTHESES = 8
 AXIS_UNITS = {
@@ -48,17 +49,19 @@ AXIS_UNITS = {
 
 
 def gap_page(found: Diagnosis, report: Report) -> str:
-    """The page of a diagnosis. report: its report (schema gap/2).
+    """The page of a diagnosis. report: its report (schema gap/3).
 
     The optional entry "provenance" of the report states the software, the libraries, the seed and the PSF at which the fit
     started.
     """
     version = report.get("provenance", {}).get("software_version", "")
-    optical = [words(e.name) for one in found.corrected[:1] for e in one.effects if e.stage == "optics"]
+    optical = [
+        words(e.name) for e in (found.corrected.effects if found.corrected else ()) if e.stage == "optics"
+    ]
     return render(
         "gap/report/page.html",
         title=f"Gap between model and images of {found.solution.transit.instrument or 'a transit'}",
-        lead=report["sentence"],
+        lead=report["lines"][0],
         footer=f"heliopsf {version}".strip(),
         found=found,
         report=report,
@@ -66,7 +69,6 @@ def gap_page(found: Diagnosis, report: Report) -> str:
         page=sys.modules[__name__],
         tables=limits,
         texts=texts,
-        answer_set="; ".join(hypothesis_words(tuple(names)) for names in report["set"]["members"]),
         optical=" and ".join(optical),
         floor_pct=f"{100 * FLOOR:g}",
         rounds=ROUNDS,
@@ -93,35 +95,30 @@ def unit_words(unit: str) -> str:
     return re.sub(r"(?<=[a-z])2\b", "²", unit)
 
 
-def field_rows(report: Report) -> list[Row]:
-    """The most probable fields of an unknown cause."""
-    rows: list[Row] = []
-    for one in report["unknown"]["fields"]:
-        beside = "".join(f", beside {words(name)}" for name in one["beside"])
-        strength, closure = one["strength"], one["closure"]
-        alike = (f"{words(near['effect'])} ({near['distance']:.1f})" for near in one["resembles"])
-        rows.append(
-            [
-                one["words"] + beside,
-                one["stage"] or "",
-                percent_words(one["probability"]),
-                ""
-                if strength is None
-                else f"{strength['value']:.2g} ± {strength['sigma']:.1g} {one['unit']}",
-                "" if closure is None else f"{100 * closure['value']:.0f} %",
-                ", ".join(alike),
-            ]
-        )
-    return rows
+def cause_rows(report: Report) -> list[Row]:
+    """Every alternative of every cause of the answer."""
+    return [
+        [
+            str(number),
+            one["words"],
+            one["stage"],
+            family_of(one["family"]).words,
+            percent_words(one["probability"]),
+        ]
+        for number, cause in enumerate(report["causes"], 1)
+        for one in cause["alternatives"]
+    ]
 
 
 def hypothesis_rows(report: Report) -> list[Row]:
-    """The most probable hypotheses: whether the answer set contains each."""
-    members = [tuple(names) for names in report["set"]["members"]]
+    """The most probable hypotheses."""
     return [
-        [hypothesis_words(names), percent_words(one["probability"]), "yes" if names in members else ""]
-        for one in report["hypotheses"][:MOST_HYPOTHESES]
-        for names in [tuple(one["effects"])]
+        [
+            " together with ".join(label_words(one["family"], one["effect"]) for one in row["causes"])
+            or "no cause",
+            percent_words(row["probability"]),
+        ]
+        for row in report["hypotheses"][:MOST_HYPOTHESES]
     ]
 
 
@@ -151,7 +148,7 @@ def psf_table(found: Diagnosis, report: Report) -> tuple[Row, list[Row]]:
     for name, first in fits[0].items():
         values = [(fit[name]["value"], fit[name]["sigma"]) for fit in fits]
         rows.append([f"{name} ({first['unit']})" if first["unit"] else name, *_compared(values)])
-    curves = [found.solution.inversion, *(one.solution.inversion for one in found.corrected[:1])]
+    curves = [found.solution.inversion, *([found.corrected.solution.inversion] if found.corrected else [])]
     for k, radius in enumerate(curves[0].radii_px):
         values = [(float(one.curve_pct[k]), float(one.curve_sigma[k])) for one in curves]
         rows.append([f"1 - encircled energy at {radius:g} px (%)", *_compared(values)])

@@ -1,8 +1,8 @@
 """The figures of a gap diagnosis: each as a PNG for a page about ten inches wide, and all of them in one picture.
 
 Residuals are simulated minus observed, in percent of the observed mean of a disc. The named effects are those that the
-verdict names as the cause of the gap ("answer" in the report). Full symbols show the fitted model without effects, open
-symbols the model with the named effects. Each pointing has a colour and a symbol.
+verdict names as the cause of the gap ("answer" in the report). Full symbols show the fitted model without any cause, open
+symbols the model with the told causes. Each pointing has a colour and a symbol.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ CERTAIN_P = 1e-12  # a smaller p-value is written as "p < 1e-12"
 _ANSWER, _OTHER = "#0072B2", "#9a9a9a"
 # Smallest and largest closure that the chart shows; longer bars are cut.
 _NO_CLOSURE, _MOST_CLOSURE = -0.35, 1.3
-_TITLES = ("Fitted model", "With the named effects")
+_TITLES = ("Fitted model", "With the told causes")
 # The cells of a disc: inner and outer radius of the ring (in radii of the dark disc), number of the sector, sectors in the ring.
 _CELLS = [(low, high, k, sectors) for low, high, sectors in RINGS for k in range(sectors)]
 
@@ -136,12 +136,18 @@ def draw_map(figure: Any, report: Report) -> None:
     tidy(charts)
 
 
-def unknown_png(report: Report) -> bytes:
-    """The most probable field of an unknown cause: a map of the detector with its errors, or a curve."""
-    field = report["unknown"]["fields"][0]
-    label = f"{field['form'].replace('_', ' ').capitalize()} {field['unit'] and '(' + field['unit'] + ')'}".rstrip()
+def field_png(report: Report) -> bytes:
+    """The first cause that has a shape: a map of the detector with its errors, or a curve."""
+    field = field_of(report)
+    assert field is not None
+    label = f"Change {field['unit'] and '(' + field['unit'] + ')'}".rstrip()
     size, draw = ((7.0, 3.4), _draw_curve) if "curve" in field else ((10.0, 4.4), _draw_field)
     return _png(*size, draw, report, field, label)
+
+
+def field_of(report: Report) -> Report | None:
+    """The field of the first cause that has one; None if there is none."""
+    return next((cause["field"] for cause in report["causes"] if cause["field"] is not None), None)
 
 
 def _draw_curve(figure: Any, report: Report, field: Report, label: str) -> None:
@@ -182,7 +188,7 @@ def cells_png(found: Diagnosis) -> bytes:
 def draw_cells(figure: Any, found: Diagnosis) -> None:
     """Draw each cell as a sector of a ring. The second chart, if effects are named, shows the model with the named effects."""
     charts = _panels(figure, bool(found.corrected))
-    evidences = [found.evidence, *(one.model.evidence for one in found.corrected[:1])]
+    evidences = [found.evidence, *([found.corrected.model.evidence] if found.corrected else [])]
     maps = [cell_means(evidence.discs) for evidence in evidences]
     top = _scale(*maps[0])
     for axes, (means, errors) in zip(charts, maps, strict=True):
@@ -301,7 +307,7 @@ def largest_residual(found: Diagnosis) -> int:
 def simulated_of(found: Diagnosis, n: int, *, with_answer: bool = False) -> NDArray[np.float64]:
     """The model image of image n [y, x], DN/s. with_answer: whether to add the change by the named effects."""
     raw = found.solution.transit.frames[n].pixels
-    solution = found.corrected[0].solution if with_answer else found.solution
+    solution = found.corrected.solution if with_answer and found.corrected else found.solution
     seen = solution.optics.field(solution.optics.convolve(solution.blanked_scene(n)))
     # The original image minus the corrected image is the change by the effects.
     return np.asarray(seen, np.float64) + (raw - solution.transit.frames[n].pixels)
@@ -315,7 +321,7 @@ def gap_png(found: Diagnosis, report: Report) -> bytes:
 def gap_figure(found: Diagnosis, report: Report) -> Figure:
     """All figures as one figure, below the summary sentence."""
     figure = Figure(figsize=(15.0, 13.2), dpi=100, facecolor="white", layout="constrained")
-    words = "\n".join(textwrap.wrap(report["sentence"], 165))
+    words = "\n".join("\n".join(textwrap.wrap(line, 165)) for line in report["lines"])
     figure.suptitle(words, fontsize=12.5, color=INK, x=0.012, ha="left", linespacing=1.4)
     bands: Any = figure.subfigures(3, 1, height_ratios=(1.0, 1.05, 1.1))
     draw_residuals(bands[0], report)
@@ -392,10 +398,8 @@ def draw_effects(axes: Any, report: Report) -> None:
 def _chosen(row: Report, report: Report) -> bool:
     """Whether a row of the report is the fit of the named effects. For a tie: whether it is the fit of a tied
     hypothesis."""
-    names, answer = set(row["name"].split(" + ")), set(report["answer"])
-    if report["verdict"] != "tie":
-        return names == answer
-    return names <= answer and names in [set(member) for member in report["set"]["members"]]
+    names = set(row["name"].split(" + "))
+    return names == set(report["answer"]) or (report["verdict"] == "tie" and names <= set(report["answer"]))
 
 
 def _draw_closure(axes: Any, y: float, closure: dict[str, Any] | None, colour: str) -> None:

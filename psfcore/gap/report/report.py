@@ -1,11 +1,10 @@
-"""The gap report as JSON (schema gap/2), and its summary sentence.
+"""The gap report as JSON (schema gap/3), and its three lines: where the gap lies, which cause explains it, and how far it shrinks.
 
-The named effects are those that the verdict names as the cause of the gap. The report lists them under "answer".
+The told causes are the most probable alternatives of each cause of the answer (`verdict.answer`), without the Sun.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,20 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from psfcore.gap.diagnose import Diagnosis
-from psfcore.gap.evidence.effect_fits import left_chi2
-from psfcore.gap.evidence.fields import UNKNOWN as UNKNOWN_NAME
-from psfcore.gap.evidence.fields import Field, FieldShape
-from psfcore.gap.verdict.closure import HeldOut
-from psfcore.gap.verdict.posterior import NONE, Form, Names, known_effects
-from psfcore.gap.verdict.unknown import UnknownField
-from psfcore.gap.verdict.verdict import LEAST_IMAGES, Judgement
+from psfcore.gap.diagnose import Diagnosis, Shrinking
+from psfcore.gap.evidence.columns import FieldShape, another
+from psfcore.gap.evidence.effect_fits import EffectFit, left_chi2
+from psfcore.gap.evidence.tree import SUN, family_of
+from psfcore.gap.verdict.answer import LEAST_IMAGES, Alternative, Cause
+from psfcore.gap.verdict.closure import HeldOut, Interval
+from psfcore.gap.verdict.where import SIGNIFICANT
 from psfcore.scatter.reconstruction import Inversion
 
-SCHEMA = "gap/2"
+SCHEMA = "gap/3"
 MOST_READ = 12  # if an effect has more parameters, the report summarises them
-LEAST_SHARE = 1e-3  # hypotheses with a smaller probability are not listed
-MOST_LISTED = 4  # hypotheses in the summary sentence
+LEAST_SHARE = 1e-3  # hypotheses and labels with a smaller probability are not listed
+LEAST_SHARE_OF_AXIS = 0.1  # an axis with a smaller share is not part of the first line
+MOST_AXES, MOST_LIMITS = 3, 3
 VISIBLE_P = 0.005  # the discs show a gap if its p-value is below this
 AXIS_WORDS = {
     "detector_x": "along detector x",
@@ -43,14 +42,16 @@ AXIS_WORDS = {
 
 
 def gap_report(found: Diagnosis) -> dict[str, Any]:
-    """The report of a diagnosis, schema gap/2."""
-    judged = found.judgement
-    fits = [(form, _fit(found, form)) for form in found.fits]
-    stated = found.limits.as_json()
-    refit = found.corrected[0] if found.corrected else None
+    """The report of a diagnosis, schema gap/3."""
+    answer, stated = found.answer, found.limits.as_json()
+    lines = three_lines(found)
+    several = found.told is not None and not (
+        len(found.told.names) == 1 and found.told.names[0] in found.fits
+    )
     return {
         "schema": SCHEMA,
-        "sentence": sentence(found),
+        "lines": lines,
+        "sentence": " ".join(line.partition(": ")[2] for line in lines),
         "gap": {
             "before_refit_pct": found.before_refit.to_json(),
             "rms_pct": found.rms.to_json(),
@@ -59,24 +60,24 @@ def gap_report(found: Diagnosis) -> dict[str, Any]:
             "p_value": found.p_value,
         },
         "where": [axis.to_json() for axis in found.where],
-        "verdict": judged.verdict,
-        "answer": list(judged.answer),
-        "set": {"coverage": judged.coverage, "members": [list(names) for names in judged.members]},
+        "verdict": answer.verdict,
+        "answer": list(answer.named),
+        "level": answer.level,
+        "causes": [_cause(found, cause) for cause in answer.causes],
+        "closure": found.shrinking_of_told and _interval(found.shrinking_of_told.closure),
+        "would_separate": would_separate(found),
         "hypotheses": [
-            {"effects": list(names), "probability": share}
-            for names, share in judged.hypotheses.items()
-            if share >= LEAST_SHARE or names in judged.members
+            {"causes": [_label(*label) for label in sorted(labels, key=str)], "probability": share}
+            for labels, share in answer.hypotheses.items()
+            if share >= LEAST_SHARE
         ],
-        "probabilities": dict(judged.effects),
+        "probabilities": {"none": answer.none, **_probabilities(found)},
         "limits": stated["limits"],
         "alike": stated["alike"],
         "calibration": found.calibration.to_json(),
-        "effects": [fit for form, fit in fits if len(form.effects) == 1 and form.field is None],
-        "together": [fit for form, fit in fits if len(form.effects) > 1 or form.field is not None],
-        "ties": [list(judged.tied)] if judged.verdict == "tie" else [],
-        "would_separate": would_separate(found),
+        "effects": [_fit(found, fit, found.shrinking[name]) for name, fit in found.fits.items()],
+        "together": [_fit(found, found.told, found.shrinking_of_told)] if several and found.told else [],
         "untestable": [{"name": name, "why": why} for name, why in found.evidence.untestable.items()],
-        "unknown": unknown(found),
         "cautions": list(found.cautions),
         "expected": {
             "residual_pct": found.expected.residual_pct,
@@ -86,7 +87,8 @@ def gap_report(found: Diagnosis) -> dict[str, Any]:
         "psf": {
             "shape": found.solution.inversion.shape.name,
             "refitted": _values(found.solution.inversion, found.model.base.covariance),
-            "with_answer": refit and _values(refit.solution.inversion, refit.covariance),
+            "with_answer": found.corrected
+            and _values(found.corrected.solution.inversion, found.corrected.covariance),
         },
         "shape": list(found.solution.transit.shape),
         "images": _images(found),
@@ -94,69 +96,64 @@ def gap_report(found: Diagnosis) -> dict[str, Any]:
     }
 
 
-def unknown(found: Diagnosis) -> dict[str, Any]:
-    """The unknown cause: its probability, its most probable fields if it is in the answer set, and the bounds of all fields.
+def _label(family: str, effect: str | None) -> dict[str, Any]:
+    return {"family": family, "effect": effect}
 
-    The probability of a field holds if an unknown cause acts.
-    """
+
+def _probabilities(found: Diagnosis) -> dict[str, float]:
+    """The probability that each effect acts, and each other form of a family."""
     return {
-        "probability": found.judgement.effects[UNKNOWN_NAME],
-        "fields": [_field(found, one) for one in found.unknown],
-        "excluded_95": [
-            _kind(field) | {"strength": strength, "unit": unit}
-            for field, (strength, unit) in found.bounds.items()
-            if math.isfinite(strength)
-        ],
+        effect or another(family): share
+        for (family, effect), share in found.answer.labels.items()
+        if share >= LEAST_SHARE or effect is not None
     }
 
 
-def _kind(field: Field) -> dict[str, Any]:
-    told = {"stage": field.stage, "form": field.form, "width": field.width}
-    return told if field.pointing is None else told | {"pointing": field.pointing}
+def _cause(found: Diagnosis, cause: Cause) -> dict[str, Any]:
+    """One cause of the answer, as JSON."""
+    first = cause.alternatives[0]
+    shape = found.shapes.get(first.family.name)
+    alone = len(found.answer.causes) == 1 and found.shrinking_of_told is not None
+    return {
+        "level": cause.level,
+        "words": cause_words(cause),
+        "alternatives": [
+            {
+                "stage": one.stage,
+                **_label(one.family.name, one.effect),
+                "probability": one.probability,
+                "words": one.words,
+            }
+            for one in cause.alternatives
+        ],
+        "field": None if shape is None or not shape.axes else _shape(shape, first),
+        "closure": _interval(found.shrinking_of_told.closure) if alone and found.shrinking_of_told else None,
+    }
 
 
-def _field(found: Diagnosis, one: UnknownField) -> dict[str, Any]:
-    shape, shrinking = one.shape, found.shrinking.get(one.form)
-    axes: dict[str, Any] = {}
+def _shape(shape: FieldShape, of: Alternative) -> dict[str, Any]:
+    """The map or the curve of a field, as JSON."""
+    k = shape.clearest
+    told = {
+        "words": of.family.words,
+        "unit": shape.unit,
+        "strength": {"value": float(shape.values[k]), "sigma": float(shape.sigma[k])},
+    }
     if shape.axes == ("x_px", "y_px"):
         x_px, y_px = (np.unique(along) for along in shape.at.T)
-        grid = y_px.size, x_px.size
-        values, sigma = (part.reshape(grid).tolist() for part in (shape.values, shape.sigma))
-        axes = {"map": {"x_px": x_px.tolist(), "y_px": y_px.tolist(), "value": values, "sigma": sigma}}
-    elif shape.axes:
-        (axis,) = shape.axes
-        at = shape.at[:, 0].tolist()
-        axes = {"curve": {axis: at, "value": shape.values.tolist(), "sigma": shape.sigma.tolist()}}
-    value = one.strength
-    return {
-        **_kind(one.field),
-        "beside": list(one.beside),
-        "unit": shape.unit,
-        "probability": one.probability,
-        "words": one.field.words,
-        "strength": None if value is None else dict(zip(("value", "sigma"), value, strict=True)),
-        **axes,
-        "closure": shrinking and shrinking.closure and shrinking.closure.to_json(),
-        "resembles": [{"effect": name, "distance": distance} for name, distance in one.resembles],
-    }
-
-
-def clearest_words(shape: FieldShape) -> str:
-    """The value and the place at which a field is clearest, as text."""
-    k = shape.clearest
-    names = {
-        "x_px": "x = {:.0f} px",
-        "y_px": "y = {:.0f} px",
-        "time_s": "{:.0f} s",
-        "radius_px": "{:.0f} px from the centre of the PSF",
-    }
-    place = ", ".join(names[axis].format(at) for axis, at in zip(shape.axes, shape.at[k], strict=True))
-    return f"{shape.values[k]:.2g} ± {shape.sigma[k]:.1g} {shape.unit}".rstrip() + f" at {place}"
+        values, sigma = (part.reshape(y_px.size, x_px.size).tolist() for part in (shape.values, shape.sigma))
+        return told | {"map": {"x_px": x_px.tolist(), "y_px": y_px.tolist(), "value": values, "sigma": sigma}}
+    at = {shape.axes[0]: shape.at[:, 0].tolist()}
+    return told | {"curve": at | {"value": shape.values.tolist(), "sigma": shape.sigma.tolist()}}
 
 
 def fits_of(report: dict[str, Any]) -> list[dict[str, Any]]:
-    """All fits of a report, in the order of display: first the fits of several effects together, then the fits of single effects."""
+    """All fits of a report, in the order of display: first the told causes together, then single effects."""
     return [*report["together"], *report["effects"]]
+
+
+def _interval(interval: Interval | None) -> dict[str, Any] | None:
+    return None if interval is None else interval.to_json()
 
 
 def _values(inversion: Inversion, covariance: NDArray[np.float64]) -> dict[str, Any]:
@@ -175,33 +172,30 @@ def _values(inversion: Inversion, covariance: NDArray[np.float64]) -> dict[str, 
     }
 
 
-def _fit(found: Diagnosis, form: Form) -> dict[str, Any]:
-    """The fit of one or several effects, with the parameters of their full refit if there is one."""
-    fit, shrinking, judged = found.fits[form], found.shrinking[form], found.judgement
-    refit = next((one for one in found.corrected if one.label == fit.label), None)
-    alone = len(fit.names) == 1 and form.field is None
-    effects = {effect.name: effect for effect in fit.model.evidence.effects}
+def _fit(found: Diagnosis, fit: EffectFit, shrinking: Shrinking | None) -> dict[str, Any]:
+    """The fit of one or several causes, with the parameters of their full refit if there is one."""
+    refit = found.corrected if found.corrected is not None and found.corrected.label == fit.label else None
+    causes = {effect.name: effect.cause for effect in fit.model.evidence.effects}
+    probabilities = _probabilities(found)
     return {
         "name": fit.label,
-        "probability": judged.effects.get(fit.names[0], 0.0)
-        if alone
-        else judged.hypotheses.get(fit.names, 0.0),
+        "probability": min(probabilities.get(name, 0.0) for name in fit.names),
         "parameters": {
             name: {"value": value, "sigma": sigma, "unit": unit}
             for name, (value, sigma, unit) in (refit or fit).values.items()
         },
         "p_value": fit.p_value,
         "delta_chi2": fit.gain,
-        "delta_chi2_held_out": shrinking.held_out_fall,
-        "closure": shrinking.closure and shrinking.closure.to_json(),
-        "closure_by_pointing": shrinking.closure_by_pointing and shrinking.closure_by_pointing.to_json(),
+        "delta_chi2_held_out": shrinking and shrinking.held_out_fall,
+        "closure": shrinking and _interval(shrinking.closure),
+        "closure_by_pointing": shrinking and _interval(shrinking.closure_by_pointing),
         "refitted": refit is not None,
-        "cause": " ".join(effects[name].cause for name in fit.names),
+        "cause": " ".join(causes[name] for name in fit.names),
     }
 
 
 def _images(found: Diagnosis) -> list[dict[str, Any]]:
-    """The disc of every image: its position, its brightness, and its held-out residuals without and with the named effects."""
+    """The disc of every image: its position, its brightness, and its held-out residuals without and with the told causes."""
     before, after = _residuals(found.residual), _residuals(found.residual_after)
     out = []
     for disc in found.evidence.discs:
@@ -236,90 +230,209 @@ def _residuals(held_out: HeldOut | None) -> dict[int, tuple[float, float]]:
 
 
 def would_separate(found: Diagnosis) -> str:
-    """The observations that would separate the tied effects, or decide an inconclusive verdict, as text; empty for other verdicts."""
-    judged = found.judgement
-    open_effects: Names = judged.tied
-    if judged.verdict == "inconclusive":
-        open_effects = tuple(dict.fromkeys(name for names in judged.named for name in names))
+    """The observations that would separate the alternatives of the causes, as text; empty if every cause has one alternative."""
     settled_by = {effect.name: effect.settled_by for effect in found.evidence.effects}
-    return "; or ".join(dict.fromkeys(settled_by[name] for name in known_effects(open_effects)))
-
-
-def sentence(found: Diagnosis) -> str:
-    """The summary of a diagnosis: two to four sentences."""
-    judged = found.judgement
-    images = len(found.evidence.discs)
-    left = f"{found.rms.value:.1f} % ({found.rms.low:.1f} to {found.rms.high:.1f})"
-    probable = f"with a probability of {percent_words(judged.effects['none'])} there is none"
-    if judged.members[0] == NONE:
-        if found.residual is None:
-            return (
-                f"No gap is visible in these {images} images ({probable}), but a gap may exist. With fewer than {LEAST_IMAGES} images, no "
-                "image can be held out, and only a large gap can be excluded."
-            )
-        return (
-            f"No gap beyond noise and the error of the fit was found: {probable}; on held-out images the gap is {left}, and the noise is "
-            f"{found.noise_pct:.1f} %.{_not_excluded(judged)}"
-        )
-    strongest = found.where[0]
-    along = AXIS_WORDS[strongest.name] + (", as the best effect does" if strongest.of_best else "")
-    numbers = strongest.at.get("pointings", [])
-    where = f"pointing{'s' if len(numbers) > 1 else ''} {' and '.join(map(str, numbers))}"
-    comma = "," if strongest.of_best else ""
-    lead = f"There is a gap of {left}. It varies most {along}{comma} and is largest in {where}."
-    if _shown_by_blocks(found):
-        lead = f"There is a gap in the unocculted field. It varies most {along}. The discs do not show it."
-    if judged.verdict == "unknown":
-        return f"{lead} Its cause is not in the library{_unknown_words(found)}."
-    if judged.verdict == "tie":
-        return (
-            f"{lead} These data cannot show which effect causes the gap: {tied_words(judged)}. To separate these effects, take "
-            f"{would_separate(found)}."
-        )
-    if judged.verdict == "inconclusive":
-        observation = would_separate(found)
-        return (
-            f"{lead if NONE not in judged.members else 'There may be a gap.'} These data do not decide its cause: "
-            f"{_listed(judged.members, judged)}.{observation and f' To decide, take {observation}.'}"
-        )
-    return f"{lead} {_explained(found)}.{_not_excluded(judged)}"
-
-
-def _unknown_words(found: Diagnosis) -> str:
-    """The most probable field of an unknown cause, as the end of a sentence."""
-    if not found.unknown:
-        return ""
-    first = found.unknown[0]
-    at = f" ({clearest_words(first.shape)})" if first.shape.axes else ""
-    return f"; it most resembles {first.field.words}{at}"
-
-
-def _not_excluded(judged: Judgement) -> str:
-    """A sentence about the hypotheses in the answer set that the verdict does not name; empty if there are none."""
-    decided = 1 if judged.verdict == "none" else len(judged.deciding)
-    others = judged.members[decided:]
-    return f" These data do not exclude {_listed(others, judged)}." if others else ""
-
-
-def _listed(members: Sequence[Names], judged: Judgement) -> str:
-    """Hypotheses with their probabilities, as text; at most MOST_LISTED, the most probable first."""
-    shown = [
-        f"{hypothesis_words(names)} ({percent_words(judged.hypotheses[names])})"
-        for names in members[:MOST_LISTED]
+    observations = [
+        settled_by[one.effect] if one.effect is not None else one.family.settled_by
+        for cause in found.answer.causes
+        if len(cause.alternatives) > 1
+        for one in cause.alternatives
     ]
-    more = len(members) - len(shown)
-    rest = [f"{more} other{'s' if more > 1 else ''} of smaller probability"] if more else []
-    *first, last = [*shown, *rest]
-    return f"{', '.join(first)} or {last}" if first else last
+    return "; or ".join(dict.fromkeys(filter(None, observations)))
 
 
-def hypothesis_words(names: Names) -> str:
-    """A hypothesis as text."""
-    if names == NONE:
-        return "no gap"
-    return " together with ".join(
-        "a cause outside the library" if name == UNKNOWN_NAME else words(name) for name in names
+# --- the three lines --------------------------------------------------------------------------------------
+
+
+def three_lines(found: Diagnosis) -> list[str]:
+    """WHERE the gap lies, WHICH cause explains it, and HOW FAR it shrinks with it; or that these data cannot say."""
+    if not found.answer.causes:
+        return [f"WHERE: {_nowhere(found)}", f"WHICH: {_nothing(found)}", f"HOW FAR: {_weaker(found)}"]
+    return [f"WHERE: {_where(found)}", f"WHICH: {_which(found)}", f"HOW FAR: {_how_far(found)}"]
+
+
+def _nowhere(found: Diagnosis) -> str:
+    images = len(found.evidence.discs)
+    if found.residual is None:
+        return (
+            f"no gap is visible in these {images} images, but a gap may exist: with fewer than {LEAST_IMAGES} images, no image can "
+            "be held out."
+        )
+    return (
+        f"no gap is detected: on held-out images the discs differ from the model by {_gap_words(found)} beyond the noise of "
+        f"{found.noise_pct:.1f} %."
     )
+
+
+def _nothing(found: Diagnosis) -> str:
+    likeliest = next(iter(found.answer.labels), None)
+    hint = (
+        ""
+        if likeliest is None
+        else f"; the most probable cause is {label_words(*likeliest)} ({percent_words(found.answer.labels[likeliest])})"
+    )
+    return f"no cause; the probability of none is {percent_words(found.answer.none)}{hint}."
+
+
+def _weaker(found: Diagnosis) -> str:
+    told = [
+        f"{words(name)} above {one.leading.excluded_95:.2g} {one.leading.unit}".rstrip()
+        for name, one in found.limits.effects.items()
+        if one.leading.excluded_95 is not None and one.leading.found_90 is not None
+    ]
+    if not told:
+        return "these data exclude no effect."
+    return f"these data exclude (95 %) {', '.join(told[:MOST_LIMITS])}; the limits of all effects are in the report."
+
+
+def _gap_words(found: Diagnosis) -> str:
+    return f"{found.rms.value:.1f} % ({found.rms.low:.1f} to {found.rms.high:.1f})"
+
+
+def _where(found: Diagnosis) -> str:
+    if shown_by_blocks(found):
+        _, blocks = found.answer.closed.chi2_left([])
+        lead = f"a gap in the unocculted field, whose images differ by {np.sqrt(blocks):.1f} times their noise; the discs do not show it"
+    else:
+        lead = f"a gap of {_gap_words(found)} in the discs"
+    axes = [axis for axis in found.where if axis.p_value <= SIGNIFICANT and axis.share >= LEAST_SHARE_OF_AXIS]
+    axes = sorted(axes, key=lambda axis: -axis.share)[:MOST_AXES]
+    told = ", ".join(f"{AXIS_WORDS[axis.name]} ({100 * axis.share:.0f} %)" for axis in axes)
+    varies = f"; it varies {told}" if told else "; it varies along no single axis"
+    numbers = found.where[0].at.get("pointings", []) if found.where else []
+    largest = (
+        f", and is largest in pointing{'s' if len(numbers) > 1 else ''} {' and '.join(map(str, numbers))}"
+    )
+    place = next((_place(found.shapes[f]) for f in _told_families(found) if f in found.shapes), "")
+    return f"{lead}{varies}{largest if numbers and told else ''}{place}."
+
+
+def _told_families(found: Diagnosis) -> list[str]:
+    return [cause.alternatives[0].family.name for cause in found.answer.causes]
+
+
+def _place(shape: FieldShape) -> str:
+    """Where a field is clearest, as the end of a sentence; empty if it has no shape."""
+    if not shape.axes:
+        return ""
+    only = " (known only near the discs)" if "x_px" in shape.axes else ""
+    return f"; the change is clearest with {clearest_words(shape)}{only}"
+
+
+def clearest_words(shape: FieldShape) -> str:
+    """The value and the place at which a field is clearest, as text."""
+    k = shape.clearest
+    names = {
+        "x_px": "x = {:.0f} px",
+        "y_px": "y = {:.0f} px",
+        "time_s": "{:.0f} s",
+        "radius_px": "{:.0f} px from the centre of the PSF",
+    }
+    place = ", ".join(names[axis].format(at) for axis, at in zip(shape.axes, shape.at[k], strict=True))
+    return f"{shape.values[k]:.2g} ± {shape.sigma[k]:.1g} {shape.unit}".rstrip() + f" at {place}"
+
+
+def _which(found: Diagnosis) -> str:
+    first, *others = found.answer.causes
+    out = cause_words(first, _numbers(found, first))
+    for cause in others:
+        out += f"; beside it {cause_words(cause, _numbers(found, cause))}"
+    observation = would_separate(found)
+    if observation:
+        out += f". These data cannot separate them; to separate them, take {observation}"
+    return f"{out}."
+
+
+def _numbers(found: Diagnosis, cause: Cause) -> str:
+    """The fitted parameters of the first alternative, as text; empty if it has none, or too many."""
+    name, told = cause.alternatives[0].effect, found.corrected or found.told
+    if name is None or name == SUN or told is None:
+        return ""
+    own = {
+        label.removeprefix(f"{name}."): value
+        for label, value in told.values.items()
+        if len(_names(found)) == 1 or label.startswith(f"{name}.")
+    }
+    if not own or len(own) > MOST_READ:
+        return ""
+    return ", ".join(
+        f"{words(label)} {v:.3g} ± {sigma:.2g} {unit}".strip() for label, (v, sigma, unit) in own.items()
+    )
+
+
+def _names(found: Diagnosis) -> tuple[str, ...]:
+    return () if found.told is None else found.told.names
+
+
+def _how_far(found: Diagnosis) -> str:
+    told, shrinking = found.told, found.shrinking_of_told
+    if told is None or shrinking is None:
+        return "a changing Sun has no form that could be taken out of the images; the fit of the PSF is not changed."
+    closure = shrinking.closure
+    if found.residual is None or closure is None:
+        return "these data cannot say: no image can be held out, or the held-out images show no gap."
+    out = f"in the model, {cause_names(told)} closes {_closure_words(closure)} of the gap on held-out images"
+    others = [
+        f"{words(name)} closes {_closure_words(other)}"
+        for name in found.answer.causes[0].effects
+        if name not in told.names
+        and name in found.shrinking
+        and (other := found.shrinking[name].closure) is not None
+    ]
+    out += "".join(f"; {other}" for other in others)
+    if shown_by_blocks(found):
+        return f"{out}."
+    verb = "falls" if found.after.value < found.rms.value else "changes"
+    return f"{out}; the gap in the discs {verb} from {found.rms.value:.1f} % to {found.after.value:.1f} %, with a noise of {found.noise_pct:.1f} %."
+
+
+def _closure_words(closure: Interval) -> str:
+    return f"{100 * closure.value:.0f} % ({100 * closure.low:.0f} to {100 * closure.high:.0f})"
+
+
+def cause_names(told: EffectFit) -> str:
+    """The told causes as text."""
+    causes = {effect.name: effect.family for effect in told.model.evidence.effects}
+    return " with ".join(
+        label_words(causes[name], None if name == another(causes[name]) else name) for name in told.names
+    )
+
+
+def label_words(family: str, effect: str | None) -> str:
+    """A label as text."""
+    return Alternative(family_of(family), effect, 0.0).words
+
+
+def cause_words(cause: Cause, numbers: str = "") -> str:
+    """A cause as text: its alternatives with their probabilities, and the level at which it is sure."""
+    shown = []
+    for k, one in enumerate(cause.alternatives):
+        own = f"{numbers}; " if numbers and k == 0 else ""
+        shown.append(f"{_alternative_words(one)} ({own}{percent_words(one.probability)})")
+    *first, last = shown
+    told = f"{', '.join(first)} or {last}" if first else last
+    if cause.level == "stage":
+        told += f", all in the {cause.alternatives[0].stage}"
+    return told
+
+
+def _alternative_words(one: Alternative) -> str:
+    return (
+        f"{one.family.words}, in a form that the library does not have"
+        if one.effect is None
+        else words(one.effect)
+    )
+
+
+def shown_by_blocks(found: Diagnosis) -> bool:
+    """Whether the blocks of the unocculted field show a gap, but the discs and their cells do not."""
+    model = found.model
+    if found.rms.value >= found.noise_pct:
+        return False
+    cells, blocks = left_chi2(model, model.base)
+    freedom = sum(disc.residual.size for disc in model.discs)
+    free_blocks = model.evidence.steady_unocculted.freedom
+    return bool(chdtrc(freedom, cells) > VISIBLE_P > chdtrc(free_blocks, max(blocks, 0.0)))
 
 
 def p_words(p_value: float) -> str:
@@ -335,52 +448,6 @@ def percent_words(share: float) -> str:
     return "< 1 %" if percent < 0.5 else f"{percent:.0f} %"
 
 
-def _shown_by_blocks(found: Diagnosis) -> bool:
-    """Whether the blocks of the unocculted field show a gap, but the discs and their cells do not."""
-    model = found.model
-    if found.rms.value >= found.noise_pct:
-        return False
-    cells, blocks = left_chi2(model, model.base)
-    freedom = sum(disc.residual.size for disc in model.discs)
-    free_blocks = model.evidence.steady_unocculted.freedom
-    return bool(chdtrc(freedom, cells) > VISIBLE_P > chdtrc(free_blocks, max(blocks, 0.0)))
-
-
-def _explained(found: Diagnosis) -> str:
-    judged = found.judgement
-    best = found.fits[judged.form(judged.named[0])]
-    values = found.corrected[0].values if found.corrected else best.values
-    numbers = [
-        f"{words(name)} {value:.3g} ± {sigma:.2g} {unit}".strip()
-        for name, (value, sigma, unit) in values.items()
-    ]
-    in_short = in_short_if_many([value for value, _, _ in values.values()])
-    told = (
-        f"The gap is explained by {words(best.label)} ({in_short or ', '.join(numbers)}), with a probability of "
-        f"{percent_words(judged.hypotheses[judged.named[0]])}"
-    )
-    closure = found.shrinking[judged.form(judged.named[0])].closure
-    if _shown_by_blocks(found):
-        return (
-            told
-            if closure is None
-            else f"{told}; on held-out images it closes {100 * closure.value:.0f} % of the gap"
-        )
-    shrinks = "falls" if found.after.value < found.rms.value else "changes"
-    return (
-        f"{told}: on held-out images the gap in the discs {shrinks} from "
-        f"{found.rms.value:.1f} % to {found.after.value:.1f} %, and the noise is {found.noise_pct:.1f} %"
-    )
-
-
-def tied_words(judged: Judgement) -> str:
-    """The text for a tie: the effects that the data cannot separate, and the effects that all deciding members contain, if any."""
-    among = " or ".join(hypothesis_words((name,)) for name in judged.tied)
-    beside = " and ".join(words(name) for name in judged.certain)
-    alone = " alone or" if any(set(names) == set(judged.certain) for names in judged.named) else ""
-    return f"{beside},{alone} together with {among}" if beside else among
-
-
 def in_short_if_many(values: Sequence[float]) -> str | None:
     """A summary of parameters if there are more than MOST_READ; otherwise None."""
     if len(values) <= MOST_READ:
@@ -391,8 +458,3 @@ def in_short_if_many(values: Sequence[float]) -> str | None:
 def words(name: str) -> str:
     """The name of an effect or parameter, with spaces, for text."""
     return name.replace("_", " ")
-
-
-def best_words(found: Diagnosis) -> str:
-    """The effects of the first full refit, as text."""
-    return " + ".join(words(effect.name) for effect in found.corrected[0].effects)

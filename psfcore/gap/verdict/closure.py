@@ -228,8 +228,10 @@ def closure(
     value = 1 - float((chi2_after - nu).sum()) / total
     low, high = np.percentile(resampled, INTERVAL)
     high = max(high, np.percentile(without_errors, INTERVAL[1]))
-    # An error of the template only lowers the closure. No effect can close more than the whole gap.
-    return Interval(value, float(low), max(value, min(float(high) + FORM_ERROR**2, 1.0)))
+    # An error of the template only lowers the closure. No cause can close more than the whole gap: an estimate above 1 is noise.
+    excess = max(value - 1.0, 0.0)
+    low, value = min(float(low) - excess, 1.0), value - excess
+    return Interval(value, low, max(value, min(float(high) + FORM_ERROR**2, 1.0)))
 
 
 def fall(before: HeldOut, after: HeldOut) -> float:

@@ -42,18 +42,15 @@ WORSE_SHARE = 0.05
 class Corrected:
     """A full refit with effects in the model.
 
-    values: value, error and unit of each parameter of the effects; the value is summed over all rounds. subtracted: the
-    amounts of the parameters that were subtracted from the images in the last round, by effect. model: the linear model
-    at the refit. beside: the same with further effects, if they were asked for. rounds: number of rounds made.
+    values: value, error and unit of each parameter of the effects; the value is summed over all rounds. model: the linear
+    model at the refit. rounds: number of rounds made.
     """
 
     effects: tuple[Effect, ...]
     solution: Solution
     model: LinearModel
     values: dict[str, tuple[float, float, str]]
-    subtracted: dict[str, tuple[float, ...]]
     rounds: int
-    beside: LinearModel | None = None
 
     @property
     def label(self) -> str:
@@ -85,8 +82,7 @@ def images_without(transit: Transit, view: View, effects: Sequence[Effect], thet
     for n, frame in enumerate(transit.frames):
         error = np.zeros(transit.shape)
         for value, change in zip(theta, changes, strict=True):
-            if change.disc:  # a change that the discs do not show is a change of the scene
-                error += value * change.change(n, view.expected)
+            error += value * change.change(n, view.expected)
         frames.append(replace(frame, pixels=(frame.pixels - error).astype(np.float32)))
     return replace(transit, frames=tuple(frames))
 
@@ -97,7 +93,6 @@ def add_to_model(
     found: EffectFit,
     model: LinearModel,
     *,
-    beside: Sequence[Effect] = (),
     view: View | None = None,
     progress: Progress = lambda stage, step, steps: None,
 ) -> Corrected:
@@ -105,8 +100,7 @@ def add_to_model(
 
     A step that changes the PSF too much is shortened as a whole.
 
-    beside: further effects, which are not fitted; `Corrected.beside` contains them. view: the view of the solution, if it
-    exists already. Raises the errors of `invert` if the first round fails, DataError "effect-unseen" if the images do not constrain the
+    view: the view of the solution, if it exists already. Raises the errors of `invert` if the first round fails, DataError "effect-unseen" if the images do not constrain the
     effects, and "bad-effects" if an added effect fails.
     """
     transit, shape = solution.transit, solution.inversion.shape
@@ -114,23 +108,20 @@ def add_to_model(
     view = view or View(solution)
     held = [_acting(hold(effect, view), found, len(effects)) for effect in effects]
     wanted = np.array([value for value, _, _ in found.values.values()])
-    # For each change of the effects, in order: whether the discs show the change.
-    in_images = np.array([change.disc for effect in held for change in effect.changes(view)], dtype=np.bool_)
     base = len(model.evidence.base)
     here, at, theta = view, solution.inversion.coordinates, np.zeros(wanted.size)
     move = found.step.values[:base]
     least, settled = np.inf, False
     taken: _Round | None = None
-    for rounds in range(1, 1 + (ROUNDS if in_images.any() else 1)):
+    for rounds in range(1, 1 + ROUNDS):
         try:
-            if in_images.any():
-                share = min(1.0, LONGEST / max(shape.length(move), 1e-9))
-                at, theta = at + share * move, theta + share * (wanted - theta)
-                images = images_without(transit, here, held, theta)
-                fit = solution_at(images, solution.total, at, threads=solution.threads, progress=progress)
-                here = View(fit)
-                return_unused_memory()  # the planes of the view before
-            seen = _fit_remaining(_with_old_jacobian(model, here, held), held, theta, in_images)
+            share = min(1.0, LONGEST / max(shape.length(move), 1e-9))
+            at, theta = at + share * move, theta + share * (wanted - theta)
+            images = images_without(transit, here, held, theta)
+            fit = solution_at(images, solution.total, at, threads=solution.threads, progress=progress)
+            here = View(fit)
+            return_unused_memory()  # the planes of the view before
+            seen = _fit_remaining(_with_old_jacobian(model, here, held), held, theta)
         except DataError:
             if taken is None:
                 raise
@@ -141,7 +132,7 @@ def add_to_model(
         acts = ~(positive & (wanted <= 0))
         if not acts.all() and rounds < ROUNDS:
             held = _those_that_act(held, acts)
-            theta, wanted, in_images = theta[acts], wanted[acts], in_images[acts]
+            theta, wanted = theta[acts], wanted[acts]
             taken, least = None, np.inf
             continue
         left_over = float(left_chi2(seen.model, seen.left.step).sum())
@@ -151,18 +142,18 @@ def add_to_model(
             break
         least = min(least, left_over)
         taken = _Round(here.solution, theta, rounds)
-        steps = np.append(move, np.where(in_images, wanted - theta, 0.0))
+        steps = np.append(move, wanted - theta)
         settled = float(np.sqrt(np.mean((steps / np.maximum(seen.sigmas, 1e-300)) ** 2))) < SETTLED
         if settled:
             break
     assert taken is not None
     del here  # its planes, before those of another view are made
     return_unused_memory()
-    if settled and in_images.any():  # the steps weigh cells; the PSF is fitted to pixels, as without effects
+    if settled:  # the steps weigh cells; the PSF is fitted to pixels, as without effects
         images, threads = taken.solution.transit, solution.threads
         fit = invert(images, shape, start=at, near=True, threads=threads, progress=progress)
         taken = replace(taken, solution=fit)
-    return _corrected(taken, held, beside, in_images, model, progress)
+    return _corrected(taken, held, model, progress)
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,25 +171,20 @@ class _Round:
 def _corrected(
     taken: _Round,
     held: Sequence[Effect],
-    beside: Sequence[Effect],
-    in_images: NDArray[np.bool_],
     model: LinearModel,
     progress: Progress,
 ) -> Corrected:
     """The refit after its last round, with the Jacobian computed there."""
-    evidence = gather(taken.solution, (*held, *beside), progress=progress)
-    evidence = _with_noise_of(model.evidence, evidence)
-    own = replace(model, evidence=_of_effects(evidence, [effect.name for effect in held]))
-    seen = _fit_remaining(own, held, taken.theta, in_images)
+    evidence = gather(taken.solution, held, progress=progress)
+    own = replace(model, evidence=_with_noise_of(model.evidence, evidence))
+    seen = _fit_remaining(own, held, taken.theta)
     fitted = zip(seen.left.values.items(), seen.theta, strict=True)
     return Corrected(
         effects=tuple(held),
         solution=taken.solution,
         model=own,
         values={name: (float(value), sigma, unit) for (name, (_, sigma, unit)), value in fitted},
-        subtracted=_by_effect(held, np.where(in_images, taken.theta, 0.0)),
         rounds=taken.rounds,
-        beside=replace(model, evidence=evidence) if beside else None,
     )
 
 
@@ -214,34 +200,8 @@ def _with_old_jacobian(model: LinearModel, view: View, held: Sequence[Effect]) -
         kept += own
     changes = [change for effect in held for change in effect.changes(view)]
     evidence = residuals_at(view, before, kept, changes)
-    numbers = {base + k: before.numbers[c] for k, c in enumerate(kept) if c in before.numbers}
-    evidence = replace(evidence, effects=tuple(held), columns=columns, numbers=numbers)
+    evidence = replace(evidence, effects=tuple(held), columns=columns)
     return replace(model, evidence=_with_noise_of(before, evidence))
-
-
-def _of_effects(evidence: Evidence, names: Sequence[str]) -> Evidence:
-    """The evidence with these effects only, whose columns must come first."""
-    columns = {name: here for name, here in evidence.columns.items() if name in names}
-    size = max((c + 1 for here in columns.values() for c in here), default=len(evidence.base))
-    return replace(
-        evidence,
-        effects=tuple(effect for effect in evidence.effects if effect.name in columns),
-        columns=columns,
-        untestable={name: why for name, why in evidence.untestable.items() if name in names},
-        numbers={column: number for column, number in evidence.numbers.items() if column < size},
-        discs=tuple(replace(disc, jacobian=disc.jacobian[:size]) for disc in evidence.discs),
-        unocculted=replace(evidence.unocculted, errors=evidence.unocculted.errors[:size]),
-    )
-
-
-def _by_effect(effects: Sequence[Effect], values: Vector) -> dict[str, tuple[float, ...]]:
-    """Split the list of values: for the name of each effect, the values of its parameters."""
-    found, first = {}, 0
-    for effect in effects:
-        last = first + len(effect.parameters)
-        found[effect.name] = tuple(float(value) for value in values[first:last])
-        first = last
-    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,13 +222,10 @@ class _Remaining:
         return np.sqrt(np.diag(self.left.step.covariance))
 
 
-def _fit_remaining(
-    model: LinearModel, held: Sequence[Effect], out: Vector, in_images: NDArray[np.bool_]
-) -> _Remaining:
+def _fit_remaining(model: LinearModel, held: Sequence[Effect], out: Vector) -> _Remaining:
     """Fit the effects to images from which these effects were already subtracted.
 
-    model: the linear model of these images. out: the current parameters. in_images: for each parameter, whether its
-    change was subtracted from the images.
+    model: the linear model of these images. out: the current parameters.
     """
     left = fit_effects(model, model.evidence.effects, any_sign=True)
     found = np.array([value for value, _, _ in left.values.values()])
@@ -279,10 +236,9 @@ def _fit_remaining(
             f"was subtracted; the images constrain {found.size} of them: they may not contain this effect",
         )
     base = len(model.evidence.base)
-    out_already = np.concatenate([np.zeros(base), np.where(in_images, out, 0.0)])
+    out_already = np.concatenate([np.zeros(base), out])
     found -= model.pull_of_prior(left.step, out_already)[base:]
-    # For a subtracted parameter the fit gives only the remainder; for the other parameters it gives the full value.
-    return _Remaining(model, left, np.where(in_images, out + found, found))
+    return _Remaining(model, left, out + found)
 
 
 def _those_that_act(effects: Sequence[Effect], acts: NDArray[np.bool_]) -> list[Effect]:

@@ -31,9 +31,7 @@ from psfcore.blind.effects.registry import EFFECTS, KNOWN, WITHHELD
 from psfcore.blind.make_case import make
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits
-from psfcore.gap import ideal_observer
 from psfcore.transit.folder import read_transit
-from tests.psfcore.gap.small_gaps import effect
 
 SIZE_PX, IMAGES = 96, 9
 LIMITS = FitsLimits(max_pixels=SIZE_PX**2)
@@ -69,7 +67,7 @@ def test_kinds_have_their_shares_and_effects_occur_in_turn() -> None:
 
 
 def test_withheld_effects_of_the_tests_occur_in_three_strengths_and_others_in_the_calibration() -> None:
-    blocks = range(9 * 24)
+    blocks = range(11 * 24)
     cases = {group: [drawn(3, n, withheld=group) for n in blocks] for group in WITHHELD}
     seen: dict[str, set[int]] = {name: set() for name in WITHHELD["test"]}
     for case in cases["test"]:
@@ -105,10 +103,14 @@ def test_strong_effects_occur_alone_in_pairs_and_beside_a_changing_sun() -> None
 
 def test_the_sun_beside_a_strong_effect_keeps_the_strength_that_was_drawn(tmp_path: Path) -> None:
     case = next(case for case in (drawn(2, n) for n in range(96)) if case.target_pct[1:] == (None,))
-    truth = make(case, tmp_path / "transit", tmp_path / "expected")
-    assert truth["effects"][1]["strength"] == case.effects[1].strength
-    assert truth["effects"][0]["strength"] != case.effects[0].strength
-    assert truth["target_pct"][1] is None
+    strengths = [effect["strength"] for effect in make(case, tmp_path / "t", tmp_path / "e")["effects"]]
+    assert strengths[1] == case.effects[1].strength and strengths[0] != case.effects[0].strength
+    clean, *alone = (
+        [frame.pixels for frame in read_transit(tmp_path / "e" / name, LIMITS).frames]
+        for name in ("without_effects", "effect_0", "effect_1")
+    )
+    for images in alone:
+        assert np.abs(np.subtract(images, clean)).max() > 0.1
 
 
 def test_the_transit_of_a_case_contains_nothing_of_the_truth(made: BlindSet) -> None:
@@ -145,11 +147,11 @@ def test_the_transit_of_a_case_contains_nothing_of_the_truth(made: BlindSet) -> 
 
 def test_the_images_without_noise_are_kept_apart_from_the_transit(made: BlindSet) -> None:
     seen = read_transit(made.transit(0), LIMITS)
-    with_effects, without = (
-        read_transit(made.expected(0) / name, LIMITS) for name in ("with_effects", "without_effects")
+    alone, without = (
+        read_transit(made.expected(0) / name, LIMITS) for name in ("effect_0", "without_effects")
     )
-    assert with_effects.noise == seen.noise
-    noisy, mean, clean = (np.array([f.pixels for f in t.frames]) for t in (seen, with_effects, without))
+    assert alone.noise == without.noise == seen.noise
+    noisy, mean, clean = (np.array([f.pixels for f in t.frames]) for t in (seen, alone, without))
     exposure_s = [frame.exposure_s for frame in seen.frames]
     variance = [seen.noise.variance(m, t) for m, t in zip(mean.astype(float), exposure_s, strict=True)]
     rounded = 1 / 12 / np.array(exposure_s)[:, None, None] ** 2  # the transit is in whole DN
@@ -158,56 +160,44 @@ def test_the_images_without_noise_are_kept_apart_from_the_transit(made: BlindSet
     change = mean - clean  # a plane, the same in all images
     np.testing.assert_allclose(change, np.broadcast_to(change[0], change.shape), atol=3e-3)
     assert np.abs(change).max() > 0.01
+    cause = {"name": "intensity_gradient", "families": ["light_place"], "stage": "detector"}
+    listed = json.loads((made.expected(0) / "causes.json").read_text())
+    assert listed == {"schema": "gap-causes/1", "causes": [{"folder": "effect_0", **cause}]}
 
 
 def test_the_truth_contains_what_an_effect_leaves_and_a_map_of_the_light_that_it_adds(made: BlindSet) -> None:
-    truth = made.truth(0)
-    (target_pct,) = truth["target_pct"]
-    assert (truth["effects"][0]["name"], truth["effects"][0]["stage"]) == ("intensity_gradient", "detector")
+    truth, (filled,) = made.truth(0), made.truth(1)["effects"]
+    (target_pct,), (effect,) = truth["target_pct"], truth["effects"]
+    assert (effect["name"], effect["families"], effect["stage"]) == (
+        "intensity_gradient",
+        ["light_place"],
+        "detector",
+    )
     assert truth["left_after_refit_pct"] == pytest.approx(target_pct, rel=0.6)
-    assert truth["effects"][0]["left_alone_pct"] == pytest.approx(target_pct, rel=0.45)
-    assert 0 < truth["clean_left_pct"] < 0.8
-    assert len(truth["refitted"]["residual_pct"]) == IMAGES
-    light = np.array(truth["light_map"]["values"])
-    assert light.mean() == pytest.approx(truth["effects"][0]["strength"], rel=0.02)
-    angle = np.deg2rad(truth["effects"][0]["parameters"]["angle_deg"])
+    assert effect["left_alone_pct"] == pytest.approx(target_pct, rel=0.45)
+    assert len(truth["residuals"]) == IMAGES
+    assert 0 < np.abs([image["clean_pct"] for image in truth["residuals"]]).max() < 2
+    light = np.array(effect["light_map"]["values"])
+    assert light.mean() == pytest.approx(effect["strength"], rel=0.02)
+    angle = np.deg2rad(effect["parameters"]["angle_deg"])
     row, column = np.unravel_index(light.argmax(), light.shape)
     assert (column > 32, row > 32) == (np.cos(angle) > 0, np.sin(angle) > 0)
-    assert "light_map" not in made.truth(1)
+    assert "light_map" not in filled and filled["also"] == ["scene_evolution"]
 
 
 def test_a_clean_case_has_a_transit_alone_also_of_a_given_scene(tmp_path: Path) -> None:
-    truth = make(drawn(4, clean_only=True), tmp_path / "transit", tmp_path / "expected")
+    case = drawn(4, clean_only=True)
+    truth = make(case, tmp_path / "transit", tmp_path / "expected")
     assert (truth["effects"], truth["left_after_refit_pct"]) == ([], 0.0)
-    assert truth["clean_left_pct"] < 0.8
-    assert not (tmp_path / "expected").exists(), "an ideal observer of clean data needs no images"
+    assert not (tmp_path / "expected").exists(), "the bound of clean data needs no images"
     assert len(read_transit(tmp_path / "transit", LIMITS).frames) == IMAGES
-    clean_case = drawn(4, clean_only=True)
     image = 100 + 20 * np.random.default_rng(1).standard_normal((300, 300))
     image[5, 5] = np.nan
-    scenes = case_scenes(clean_case, [image])
+    scenes = case_scenes(case, [image])
     assert all(scene.shape == (2 * SIZE_PX, 2 * SIZE_PX) and scene.min() >= 0 for scene in scenes.values())
     np.testing.assert_array_equal(scenes[1][:, ::-1], scenes[3])
     with pytest.raises(DataError, match="bad-scene"):
-        case_scenes(clean_case, [np.zeros((300, 300))])
-
-
-def test_the_ideal_observer_measures_what_the_maker_of_a_case_measured(
-    made: BlindSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """With few effects, which is quicker. Bad arguments and folders are said."""
-    monkeypatch.setattr(ideal_observer, "LIBRARY", [effect("intensity_gradient"), effect("dark_offset")])
-    file = tmp_path / "ideal.json"
-    assert ideal_observer.main([str(tmp_path)]) == 2
-    assert "expected two arguments" in capsys.readouterr().err
-    assert ideal_observer.main([str(tmp_path), str(file)]) == 1
-    assert "no-manifest" in capsys.readouterr().err and not file.exists()
-    assert ideal_observer.main([str(made.expected(0)), str(file)]) == 0
-    ideal = json.loads(file.read_text())
-    assert ideal["left_after_refit_pct"] == pytest.approx(made.truth(0)["left_after_refit_pct"], rel=0.15)
-    left = {tuple(one["effects"]): one["chi2"] for one in ideal["hypotheses"]}
-    assert left[()] == ideal["noncentrality"] > 1
-    assert left[("intensity_gradient",)] < 0.2 * left[()]
+        case_scenes(case, [np.zeros((300, 300))])
 
 
 def test_a_set_keeps_its_truth_its_plan_and_one_run(made: BlindSet, tmp_path: Path) -> None:

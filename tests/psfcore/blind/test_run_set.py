@@ -9,12 +9,11 @@ from pathlib import Path
 import pytest
 
 from psfcore.blind.case_set import BlindSet
-from psfcore.blind.run_set import IDEAL_SCHEMA, REPORT_SCHEMA, result_in, run_of, run_set
+from psfcore.blind.run_set import BOUND_SCHEMA, REPORT_SCHEMA, result_in, run_of, run_set
 from psfcore.blind.score import judged_cases
 from psfcore.errors import DataError
 
-TRUTH = {"kind": "clean", "effects": [], "left_before_refit_pct": 0.0, "left_after_refit_pct": 0.0}
-IDEAL_FOUND = {"schema": "gap-ideal/1", "noncentrality": 3.0, "hypotheses": [], "found": ["with_effects"]}
+TRUTH = {"kind": "clean", "effects": []}
 # A diagnosis that logs its transit and reports the files that it can see.
 DIAGNOSIS = """
 import json, os, pathlib, sys
@@ -22,7 +21,7 @@ transit, report, log = sys.argv[1:4]
 with open(log, "a") as lines:
     lines.write(pathlib.Path(transit, "transit.json").read_text() + "\\n")
 seen = sorted(str(path.relative_to(os.getcwd())) for path in pathlib.Path(os.getcwd()).rglob("*"))
-told = {"schema": "gap/2", "verdict": "none", "set": {"members": [[]]}, "seen": seen, "at": os.getcwd()}
+told = {"schema": "gap/3", "verdict": "none", "causes": [], "seen": seen, "at": os.getcwd()}
 pathlib.Path(report).write_text(json.dumps(told))
 """
 
@@ -40,13 +39,13 @@ def blind(tmp_path: Path) -> BlindSet:
     return made
 
 
-IDEAL = """
+BOUND = """
 import json, pathlib, sys
-expected, ideal, log = map(pathlib.Path, sys.argv[1:4])
+expected, bound, log = map(pathlib.Path, sys.argv[1:4])
 with open(log, "a") as lines:
-    lines.write("ideal\\n")
-about = {"schema": "gap-ideal/1", "noncentrality": 3.0, "hypotheses": []}
-ideal.write_text(json.dumps(about | {"found": sorted(p.name for p in expected.iterdir())}))
+    lines.write("bound\\n")
+seen = sorted(path.name for path in expected.iterdir())
+bound.write_text(json.dumps({"schema": "gap-bound/1", "causes": [], "seen": seen}))
 """
 
 
@@ -54,13 +53,13 @@ def command(log: Path, code: str = DIAGNOSIS) -> list[str]:
     return [sys.executable, "-c", code, "{transit}", "{report}", str(log)]
 
 
-def ideal(log: Path, code: str = IDEAL) -> list[str]:
-    return [sys.executable, "-c", code, "{expected}", "{ideal}", str(log)]
+def bound(log: Path, code: str = BOUND) -> list[str]:
+    return [sys.executable, "-c", code, "{expected}", "{bound}", str(log)]
 
 
 def test_a_diagnosis_sees_only_a_copy_of_the_transit(blind: BlindSet, tmp_path: Path) -> None:
     (run,) = run_set(blind, [1], command(tmp_path / "log"), keep=True)
-    assert not run.failed and run.wall_s > 0 and run.peak_mib > 1
+    assert not run.error and run.wall_s > 0 and run.peak_mib > 1
     report = result_in(blind.report(1), REPORT_SCHEMA)
     assert report is not None
     assert report["seen"] == ["transit", "transit/transit.json", "words.txt"]
@@ -72,7 +71,7 @@ def test_a_diagnosis_sees_only_a_copy_of_the_transit(blind: BlindSet, tmp_path: 
 
 def test_only_cases_without_a_complete_report_are_diagnosed(blind: BlindSet, tmp_path: Path) -> None:
     log = tmp_path / "log"
-    blind.report(2).write_text('{"schema": "gap/2", "verd')
+    blind.report(2).write_text('{"schema": "gap/3", "verd')
     run_set(blind, [0, 1], command(log), processes=2)
     assert not blind.transit(0).exists(), "a transit is deleted after its diagnosis"
     run_set(blind, [0, 1, 2], command(log), processes=2)
@@ -84,11 +83,11 @@ def test_only_cases_without_a_complete_report_are_diagnosed(blind: BlindSet, tmp
 def test_failures_are_kept_apart_and_tried_again(blind: BlindSet, tmp_path: Path) -> None:
     log = tmp_path / "log"
     (broken,) = run_set(blind, [0], command(log, "import sys; sys.exit('no light')"))
-    assert broken.failed and "no light" in broken.error and blind.transit(0).is_dir()
+    assert "no light" in broken.error and blind.transit(0).is_dir()
     (silent,) = run_set(blind, [1], command(log, "pass"))
-    assert "gap/2" in silent.error
+    assert "gap/3" in silent.error
     (late,) = run_set(blind, [2], command(log, "import time; time.sleep(60)"), longest_s=0.5)
-    assert late.failed and "killed after" in late.error and late.wall_s < 20
+    assert "killed after" in late.error and late.wall_s < 20
     judged, failures = judged_cases(blind, range(2))
     assert judged == [] and "no light" in failures[0]
     run_set(blind, [0], command(log))
@@ -96,28 +95,27 @@ def test_failures_are_kept_apart_and_tried_again(blind: BlindSet, tmp_path: Path
     assert ([case.number for case in judged], list(failures)) == ([0], [1])
 
 
-def test_the_ideal_observer_sees_the_images_without_noise_once(blind: BlindSet, tmp_path: Path) -> None:
+def test_the_program_of_the_bound_sees_the_images_without_noise_once(blind: BlindSet, tmp_path: Path) -> None:
     log = tmp_path / "log"
-    (blind.expected(1) / "with_effects").mkdir()
-    (run,) = run_set(blind, [1], command(log), ideal=ideal(log))
-    assert not run.failed
-    assert result_in(blind.ideal(1), IDEAL_SCHEMA) == IDEAL_FOUND
+    (blind.expected(1) / "effect_0").mkdir()
+    (run,) = run_set(blind, [1], command(log), bound=bound(log))
+    assert not run.error
+    assert (result_in(blind.bound(1), BOUND_SCHEMA) or {})["seen"] == ["effect_0"]
     assert not blind.expected(1).exists(), "the images are deleted after their use"
-    assert run_set(blind, [1], command(log), ideal=ideal(log)) == []
-    assert log.read_text().splitlines() == ["case 1", "ideal"]
-    judged, _ = judged_cases(blind, [1])
-    assert judged[0].ideal == IDEAL_FOUND
-    # An ideal observer that fails is tried again without a new diagnosis.
+    assert run_set(blind, [1], command(log), bound=bound(log)) == []
+    assert log.read_text().splitlines() == ["case 1", "bound"]
+    assert judged_cases(blind, [1])[0][0].bound == result_in(blind.bound(1), BOUND_SCHEMA)
+    # If the program fails, it is tried again without a new diagnosis.
     log.write_text("")
     said: list[str] = []
-    run_set(blind, [0], command(log), ideal=ideal(log, "import sys; sys.exit('dark')"), progress=said.append)
-    assert said[-1] == "case 0000 has no ideal observer: exit status 1: dark"
-    assert result_in(blind.ideal(0), IDEAL_SCHEMA) is None
+    run_set(blind, [0], command(log), bound=bound(log, "import sys; sys.exit('dark')"), progress=said.append)
+    assert "no bound: exit status 1: dark" in said[-1]
+    assert result_in(blind.bound(0), BOUND_SCHEMA) is None
     assert result_in(blind.report(0), REPORT_SCHEMA) and blind.expected(0).is_dir()
-    run_set(blind, [0], command(log), ideal=ideal(log), keep=True)
-    assert result_in(blind.ideal(0), IDEAL_SCHEMA) is not None
+    run_set(blind, [0], command(log), bound=bound(log), keep=True)
+    assert result_in(blind.bound(0), BOUND_SCHEMA) is not None
     assert blind.expected(0).is_dir(), "kept on request"
-    assert log.read_text().splitlines() == ["case 0", "ideal"]
+    assert log.read_text().splitlines() == ["case 0", "bound"]
 
 
 def test_other_reports_bad_commands_and_changed_or_missing_truths_are_refused(
@@ -125,12 +123,12 @@ def test_other_reports_bad_commands_and_changed_or_missing_truths_are_refused(
 ) -> None:
     log = tmp_path / "log"
     run_set(blind, [0], command(log))
-    (other,) = run_set(blind, [1], command(log, DIAGNOSIS.replace("gap/2", "gap/9")))
-    assert "gap/2" in other.error and "gap/9" in other.error
+    (other,) = run_set(blind, [1], command(log, DIAGNOSIS.replace("gap/3", "gap/9")))
+    assert "gap/3" in other.error and "gap/9" in other.error
     with pytest.raises(DataError, match="bad-command"):
         run_set(blind, [0], ["heliopsf", "gap", "{transit}"])
     with pytest.raises(DataError, match="bad-command"):
-        run_set(blind, [0], command(log), ideal=["observe", "{expected}"])
+        run_set(blind, [0], command(log), bound=["observe", "{expected}"])
     with pytest.raises(DataError, match="not-sealed"):
         run_set(blind, [7], command(log))
     # A truth that was changed after its diagnosis is not scored.

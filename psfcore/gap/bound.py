@@ -1,0 +1,181 @@
+"""The bound of a simulated case: what a Bayes observer can know about each true cause from such data.
+
+The observer knows the noise and the true form of each cause, and has the forms of the library and the free fields as rivals. Its data
+are simulated in the design of the case: images without noise give the change by a cause, and its cells and blocks (`evidence.cells`,
+`unocculted_blocks`) get noise and a random brightness DRAWS times. For each draw, the observer weighs no cause and every form alone
+(`closed_form`), and answers as `verdict.answer` does, at the level LEVEL.
+
+    python -m psfcore.gap.bound FOLDER FILE.json
+
+FOLDER/without_effects and FOLDER/effect_0, ... are transits of noise-free images (DN, fractions allowed), with the noise figures of
+real ones; FOLDER/causes.json names the cause and the right families of each. FILE.json (gap-bound/1) states for each cause its
+noncentrality (the chi2 of its change that a refit of the PSF leaves), and the probability that the observer detects a gap, and that
+its answer is the truth alone at the levels of the name, the family and the stage. It is a separate program, so that the code that
+simulated the transit and the gap library share nothing.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.special import logsumexp
+
+from psfcore.build import known_diffraction
+from psfcore.errors import DataError
+from psfcore.files import write_whole
+from psfcore.fits.blocks import LIMITS
+from psfcore.gap.effect import Change, Effect, EffectParameter
+from psfcore.gap.evidence.closed_form import ClosedForm, Form
+from psfcore.gap.evidence.columns import FieldColumns
+from psfcore.gap.evidence.evidence import gather
+from psfcore.gap.evidence.linear_model import LinearModel
+from psfcore.gap.evidence.tree import family_of
+from psfcore.gap.library.registry import LIBRARY
+from psfcore.gap.verdict.answer import NONE, ONE, Labels, causes_of, label_of, prior_of
+from psfcore.scatter.inversion import invert
+from psfcore.transit.folder import read_transit
+from psfcore.transit.transit import Transit
+
+SCHEMA = "gap-bound/1"
+DRAWS, LEVEL = 100, 0.9
+
+
+@dataclass(frozen=True)
+class TrueCause:
+    """A true cause. name: its name in the library; None if it is withheld. families: the right families, the main one first."""
+
+    transit: Transit
+    name: str | None
+    families: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Bound:
+    """What an observer can know of one cause: see the module."""
+
+    noncentrality: float
+    detected: float
+    name: float
+    family: float
+    stage: float
+
+
+def bounds(without: Transit, causes: Sequence[TrueCause], seed: int = 1) -> tuple[Bound, ...]:
+    """The bound of every cause alone. without: the noise-free images without any cause. Raises the errors of `invert`."""
+    solution = invert(without)
+    true = [_true_effect(number, cause, without) for number, cause in enumerate(causes)]
+    evidence = gather(solution, (*LIBRARY, *true))
+    model = LinearModel(evidence, floor=0.0)
+    columns = FieldColumns(evidence)
+    own = [effect.name for effect in true]
+    rng = np.random.default_rng(seed)
+    return tuple(_bound(model, columns, own, number, cause, rng) for number, cause in enumerate(causes))
+
+
+def _true_effect(number: int, cause: TrueCause, without: Transit) -> Effect:
+    """The true change by a cause, as an effect whose parameter is 1."""
+
+    def change(n: int, images: object) -> Any:
+        return cause.transit.frames[n].pixels - without.frames[n].pixels
+
+    return Effect(
+        f"true_{number}",
+        family_of(cause.families[0]).stage,
+        (EffectParameter("strength", "", 1.0),),
+        "",
+        "",
+        (),
+        lambda view: [Change(change)],
+        family=cause.families[0],
+    )
+
+
+def _bound(
+    model: LinearModel,
+    columns: FieldColumns,
+    own: Sequence[str],
+    number: int,
+    cause: TrueCause,
+    rng: np.random.Generator,
+) -> Bound:
+    evidence, blocks = model.evidence, model.evidence.unocculted
+    if own[number] not in evidence.columns:
+        return Bound(0.0, 0.0, 0.0, 0.0, 0.0)
+    (column,) = evidence.columns[own[number]]
+    mean = np.concatenate([disc.jacobian[column] for disc in model.discs])
+    discs = mean[:, None] + rng.standard_normal((mean.size, DRAWS))
+    noise = np.sqrt(blocks.variance)[..., None] * rng.standard_normal((*blocks.levels.shape, DRAWS))
+    bright = blocks.gain_width * rng.standard_normal((len(blocks.levels), 1, DRAWS))
+    levels = blocks.errors[column][..., None] + noise + blocks.means[..., None] * bright
+    closed = ClosedForm(model, columns, draws=(discs, levels))
+    forms = [
+        _as_known(form, own[number], cause)
+        for form in closed.forms
+        if form.effect not in own or form.effect == own[number]
+    ]
+    # The observer knows the true form, so the form of the library is no rival.
+    known = [
+        form
+        for form in forms
+        if cause.name is None or form.effect != cause.name or form.field or column in form.columns
+    ]
+    prior = prior_of(known)
+    weights = np.array([np.log(ONE * prior[form]) + closed.of_form(form)[0] for form in known])
+    whole = np.concatenate([np.full((1, DRAWS), np.log(NONE)), weights])
+    shares = np.exp(whole - logsumexp(whole, axis=0))
+    right = {"name": 0, "family": 0, "stage": 0}
+    detected, stages = 0, {family_of(family).stage for family in cause.families}
+    for draw in shares.T:
+        by_label: dict[Labels, float] = {frozenset(): float(draw[0])}
+        for form, share in zip(known, draw[1:], strict=True):
+            label = frozenset([label_of(form)])
+            by_label[label] = by_label.get(label, 0.0) + float(share)
+        told = causes_of(by_label, LEVEL)
+        if not told:
+            continue
+        detected += 1
+        labels = [(one.family.name, one.effect) for one in told[0].alternatives]
+        right["name"] += len(labels) == 1 and labels[0][1] == cause.name and labels[0][0] in cause.families
+        right["family"] += all(family in cause.families for family, _ in labels)
+        right["stage"] += all(one.stage in stages for one in told[0].alternatives)
+    noncentrality = float(closed.normal(np.array([column]))[0, 0])
+    return Bound(noncentrality, detected / DRAWS, *(count / DRAWS for count in right.values()))
+
+
+def _as_known(form: Form, own: str, cause: TrueCause) -> Form:
+    """The form of the true cause under the name of the library, and with one scale: its strength is as likely as the true one."""
+    return replace(form, effect=cause.name, scales=(1.0,)) if form.effect == own else form
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run the program. Returns the exit status."""
+    if len(arguments) != 2:
+        print(f"expected two arguments, a folder and a JSON file; got {len(arguments)}", file=sys.stderr)
+        return 2
+    folder, file = (Path(one) for one in arguments)
+    try:
+        listed = json.loads((folder / "causes.json").read_text("utf-8"))["causes"]
+        causes = [
+            TrueCause(_read(folder / one["folder"]), one["name"], tuple(one["families"])) for one in listed
+        ]
+        found = bounds(_read(folder / "without_effects"), causes)
+    except DataError as error:
+        print(f"{error.code}: {error.message}", file=sys.stderr)
+        return 1
+    content = {"schema": SCHEMA, "causes": [vars(one) for one in found]}
+    write_whole(file, json.dumps(content, allow_nan=False))
+    return 0
+
+
+def _read(folder: Path) -> Transit:
+    return read_transit(folder, LIMITS, diffraction=lambda name, _: known_diffraction(name, threads=1))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
