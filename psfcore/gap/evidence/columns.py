@@ -281,9 +281,12 @@ class FieldColumns:
         forms = self._responses(field).discs.shape[2]
         (y, x), edge = self.at, self._evidence.box_px
         axes: tuple[str, ...] = ()
-        at, of_forms, now = np.zeros((0, 0)), np.zeros((0, forms)), weight[-1:]
+        at: Matrix = np.zeros((0, 0))
+        of_forms: Matrix = np.zeros((0, forms))
+        now = weight[-1:]
         if field.operator == "kernel":
-            axes, at = ("radius_px",), np.exp2(self.octaves)[:, None] * float(edge)
+            axes = ("radius_px",)
+            at = np.array([[edge * 2.0**octave] for octave in self.octaves.tolist()], dtype=np.float64)
             of_forms = np.kron(self._rings.T, np.eye(1, len(_FACTORS)))
         elif field.operator == "ring" or (field.modulation == "time" and field.operator != "tilted_kernel"):
             axes, at = ("time_s",), np.array([[info.time_s] for info in self._infos])

@@ -38,14 +38,6 @@ VERDICTS = {
     "inconclusive": "the alternatives are of different kinds: effects of the library, and other forms",
 }
 MOST_HYPOTHESES = 8
-AXIS_UNITS = {
-    "detector_x": "px",
-    "detector_y": "px",
-    "time": "s after the first image",
-    "intensity": "DN/s",
-    "exposure": "s",
-    "scattering_distance": "px",
-}
 
 
 def gap_page(found: Diagnosis, report: Report) -> str:
@@ -80,14 +72,6 @@ def interval_words(interval: dict[str, Any]) -> str:
     """A value with its 90 % interval, "5.1 (4.4 to 5.9)"."""
     value, low, high = (round(one, 1) + 0.0 for one in (interval["value"], *interval["ci90"]))
     return f"{value:.1f} ({low:.1f} to {high:.1f})"
-
-
-def range_words(axis: str, at: dict[str, Any]) -> str:
-    """The range of an axis in the pointings with the largest gap, as text."""
-    if "range" not in at:
-        return ""
-    low, high = at["range"]
-    return f" (from {low:.4g} to {high:.4g} {AXIS_UNITS[axis]})"
 
 
 def unit_words(unit: str) -> str:

@@ -62,7 +62,7 @@ Key = TypeVar("Key")
 NONE, ONE, TWO = 0.34, 0.44, 0.22
 AND_SUN = 0.1  # prior probability that the Sun acts beside two forms
 FLOOR = 20.0
-FURTHER = 0.75
+FURTHER = (0.75, 0.9)  # for a second and a third cause
 BEATEN = 9.0
 IDLE = 0.5  # a further cause that makes a hypothesis less probable by this factor does not act
 LEAST_IMAGES = 6
@@ -181,7 +181,7 @@ def answer_of(model: LinearModel, level: float) -> Answer:
     shares = weighed.probabilities()
     none = shares.get((), 0.0)
     by_label = _sum((frozenset(map(label_of, forms)), share) for forms, share in shares.items())
-    causes = causes_of(by_label, level, _counts(shares))
+    causes = causes_of(by_label, level)
     verdict, named = _verdict(causes, len(model.evidence.discs))
     acting = max((forms for forms in shares if forms), key=lambda forms: shares[forms])
     return Answer(
@@ -346,30 +346,21 @@ def _of_labels(shares: Mapping[Labels, float]) -> dict[Label, float]:
     return dict(out)
 
 
-def _counts(shares: Mapping[Hypothesis, float]) -> dict[int, float]:
-    return _sum((len(set(map(label_of, forms))), share) for forms, share in shares.items())
-
-
-def causes_of(
-    shares: Mapping[Labels, float], level: float, counts: Mapping[int, float] | None = None
-) -> tuple[Cause, ...]:
+def causes_of(shares: Mapping[Labels, float], level: float) -> tuple[Cause, ...]:
     """The causes of the answer. shares: the probability of each set of labels."""
     none = shares.get(frozenset(), 0.0)
     if none * (1 + FLOOR) > 1:
         return ()
     some = {labels: share / (1 - none) for labels, share in _settled(shares).items() if labels}
-    whole, found, banned = _of_labels(some), [], set()
+    whole, found = _of_labels(some), list[Cause]()
     rest = some
-    for number in range(1, 4):
-        if sum(share for labels, share in some.items() if len(labels) >= number) < (
-            FURTHER if number > 1 else 0.0
-        ):
+    for number, least in enumerate((0.0, *FURTHER), 1):
+        if sum(share for labels, share in some.items() if len(labels) >= number) < least:
             break
         group = smallest_group(rest, level)
         if not group:
             break
         found.append(Cause(tuple(_alternative(label, whole[label]) for label in group)))
-        banned |= set(group)
         rest = _sum(
             (labels - {next((x for x in group if x in labels), None)}, share)
             for labels, share in rest.items()
