@@ -287,7 +287,7 @@ class FieldColumns:
         if field.operator == "kernel":
             axes = ("radius_px",)
             at = np.array([[edge * 2.0**octave] for octave in self.octaves.tolist()], dtype=np.float64)
-            of_forms = np.kron(self._rings.T, np.eye(1, len(_FACTORS)))
+            of_forms = np.asarray(np.kron(self._rings.T, np.eye(1, len(_FACTORS))), dtype=np.float64)
         elif field.operator == "ring" or (field.modulation == "time" and field.operator != "tilted_kernel"):
             axes, at = ("time_s",), np.array([[info.time_s] for info in self._infos])
             of_forms, now = np.ones((1, forms)) if optics else np.eye(1, forms), weight
