@@ -120,7 +120,7 @@ def effect_rows(report: Report) -> list[Row]:
         if closure is not None:
             value, low, high = (f"{round(100 * one) + 0}" for one in (closure["value"], *closure["ci90"]))
             cells = [value, f"{low} to {high}"]
-        row = [words(effect["name"]), percent_words(effect["probability"]), in_short or "; ".join(numbers)]
+        row = [effect["words"], percent_words(effect["probability"]), in_short or "; ".join(numbers)]
         rows.append([*row, DASH if fall is None else f"{fall:.1f}", *cells, p_words(effect["p_value"])])
     return rows
 

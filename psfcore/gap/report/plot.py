@@ -380,7 +380,7 @@ def draw_effects(axes: Any, report: Report) -> None:
         _draw_closure(axes, float(y), row["closure"], _ANSWER if chosen else _OTHER)
         axes.text(1.52, y, percent_words(row["probability"]), va="center", ha="right", fontsize=9)
         mark = {"attributed": "named", "tie": "tied"}.get(report["verdict"], "") if chosen else ""
-        names.append(row["name"].replace("_", " ") + (f"  ({mark})" if mark else ""))
+        names.append(row["words"] + (f"  ({mark})" if mark else ""))
     axes.text(
         1.52, at.max(initial=0) + 0.75, "probability", va="center", ha="right", fontsize=9, color="#555555"
     )

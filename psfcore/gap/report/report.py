@@ -179,6 +179,7 @@ def _fit(found: Diagnosis, fit: EffectFit, shrinking: Shrinking | None) -> dict[
     probabilities = _probabilities(found)
     return {
         "name": fit.label,
+        "words": cause_names(fit),
         "probability": min(probabilities.get(name, 0.0) for name in fit.names),
         "parameters": {
             name: {"value": value, "sigma": sigma, "unit": unit}
@@ -298,12 +299,12 @@ def _where(found: Diagnosis) -> str:
     axes = [axis for axis in found.where if axis.p_value <= SIGNIFICANT and axis.share >= LEAST_SHARE_OF_AXIS]
     axes = sorted(axes, key=lambda axis: -axis.share)[:MOST_AXES]
     told = ", ".join(f"{AXIS_WORDS[axis.name]} ({100 * axis.share:.0f} %)" for axis in axes)
-    varies = f"; it varies {told}" if told else "; it varies along no single axis"
+    place = next((_place(found.shapes[f]) for f in _told_families(found) if f in found.shapes), "")
+    varies = f"; it varies {told}" if told else "" if place else "; it varies along no single axis"
     numbers = found.where[0].at.get("pointings", []) if found.where else []
     largest = (
         f", and is largest in pointing{'s' if len(numbers) > 1 else ''} {' and '.join(map(str, numbers))}"
     )
-    place = next((_place(found.shapes[f]) for f in _told_families(found) if f in found.shapes), "")
     return f"{lead}{varies}{largest if numbers and told else ''}{place}."
 
 

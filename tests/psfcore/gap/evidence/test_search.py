@@ -1,4 +1,4 @@
-"""Searches before a fit: changes of the PSF, rotated meshes, blurs, halos, copies, and a changing Sun; patches around the discs."""
+"""Searches before a fit: changes of the PSF, rotated meshes, blurs, halos and copies; patches around the discs."""
 
 from __future__ import annotations
 
@@ -24,9 +24,7 @@ from psfcore.psf import crop_or_pad
 from psfcore.scatter.total_psf import Blur
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.transit import simulate
-from psfcore.transit.occulter import coverage
-from psfcore.transit.transit import Frame, Transit
-from tests.psfcore.gap.small_gaps import changed, clean, effect, fit, large, solution, view
+from tests.psfcore.gap.small_gaps import changed, clean, effect, fit, solution, view
 from tests.transit_files import TRUTH, diffraction
 
 Plane = NDArray[np.float64]
@@ -157,34 +155,6 @@ def test_a_wide_halo_is_found_at_about_its_width() -> None:
     model = LinearModel(gather(seen.solution, library, view=seen), FLOOR)
     share, sigma, _ = fit_effects(model, library[:1]).values["share"]
     assert share > 5 * sigma
-
-
-def brightening(share: float) -> Transit:
-    """A patch of the first pointing brightens by a share over its images; behind the occulter it does not show."""
-    transit = large()
-    times = [frame.time_s for frame in transit.frames if frame.pointing == 1]
-    y, x = np.indices(transit.shape)
-    patch = np.exp(-((y - 90) ** 2 + (x - 40) ** 2) / (2 * 15**2))
-
-    def brighter(n: int, frame: Frame) -> np.ndarray:
-        at = (frame.time_s - times[0]) / (times[-1] - times[0]) - 0.5 if frame.pointing == 1 else 0.0
-        return frame.pixels * (1 + share * at * patch * (1 - coverage(transit.shape, frame.place)))
-
-    return changed(transit, brighter)
-
-
-def test_a_changing_sun_shows_only_in_the_unocculted_field() -> None:
-    for share in (0.0, 1.0):
-        seen = solution() if share == 0 else fit(brightening(share))
-        evidence = gather(seen, [effect("scene_evolution")])
-        columns = evidence.columns["scene_evolution"]
-        assert all((disc.jacobian[list(columns)] == 0).all() for disc in evidence.discs)
-        sun = fit_effects(LinearModel(evidence, FLOOR), evidence.effects)
-        # It pays for every number measured in the unocculted field, but for no more than that field has.
-        assert 10 < evidence.numbers_of(columns) < evidence.all_unocculted.freedom
-        assert (sun.p_value < 1e-6) == (share > 0)
-        # The change is linear in time, so the uneven part is left out.
-        assert set(sun.values) == ({"rms"} if share > 0 else set())
 
 
 def test_a_copy_is_found_at_its_place_with_its_blur() -> None:
