@@ -128,10 +128,17 @@ class Inexact:
     variants: tuple[Variant, ...]
     values: Vector
 
-    def change(self, design: Matrix) -> Matrix:
-        """The error of form of a change (..., columns)."""
-        columns = np.concatenate([one.columns for one in self.variants])
-        return np.asarray(FORM_ERROR * (design[..., columns] @ self.values))
+    def change(self, design: Matrix, numbers: Columns) -> Matrix:
+        """The error of form of a change. design: (..., columns). numbers: of its columns; other columns are 0 there."""
+        place = {number: k for k, number in enumerate(numbers.tolist())}
+        columns = np.concatenate([one.columns for one in self.variants]).tolist()
+        shown = [
+            (place[column], value)
+            for column, value in zip(columns, self.values, strict=True)
+            if column in place
+        ]
+        at, values = [k for k, _ in shown], [value for _, value in shown]
+        return np.asarray(FORM_ERROR * (design[..., at] @ np.array(values)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,7 +242,7 @@ class ClosedForm:
         )
         if self._inexact is not None:
             change, ends = (
-                self._inexact.change(whole),
+                self._inexact.change(whole, np.arange(self._size)),
                 np.cumsum([0, *(disc.residual.size for disc in model.discs)]),
             )
             change = change - whole[:, :base] @ np.linalg.lstsq(whole[:, :base], change, rcond=None)[0]
@@ -269,9 +276,7 @@ class ClosedForm:
                 np.zeros(blocks.levels[here].shape),
             )
             if self._inexact is not None:
-                every = np.zeros((*columns.shape[:2], self._size))
-                every[..., self._in_blocks] = columns
-                change = self._inexact.change(every)
+                change = self._inexact.change(columns, self._in_blocks)
             weight = np.where(blocks.free[here], 1 / (variance + change**2), 0.0)
             use = (weight > 0).sum(axis=0) >= LEAST_IMAGES
             if not use.any():
@@ -481,9 +486,11 @@ def _joined(variants: Sequence[Variant]) -> tuple[Columns, Vector, NDArray[np.bo
 
 
 def _centred(design: Matrix, weight: Matrix) -> Matrix:
-    """A design (images, blocks, columns) in units of the noise, with the mean scene of each block eliminated. weight: (images, blocks)."""
-    total = np.maximum(weight.sum(axis=0), 1e-300)
-    mean = np.einsum("nb,nbc->bc", weight / total, design)
-    design = design - mean
+    """The design (images, blocks, columns), changed to units of the noise with the mean scene of each block eliminated.
+
+    weight: (images, blocks).
+    """
+    # In place: for long transits of large images, the design takes most of the memory of a diagnosis.
+    design -= np.einsum("nb,nbc->bc", weight / np.maximum(weight.sum(axis=0), 1e-300), design)
     design *= np.sqrt(weight)[..., None]
     return design

@@ -32,7 +32,8 @@ Matrix = NDArray[np.float64]
 Vector = NDArray[np.float64]
 
 BLOCK_PX = 32
-LEAST_BLOCKS = 5  # least number of blocks along the shorter side: small images get smaller blocks
+# Number of blocks along the shorter side: small images get smaller blocks, large ones get larger blocks.
+LEAST_BLOCKS, MOST_BLOCKS = 5, 32
 FREE_OF_DISC_PX = 20.0  # pixels up to this distance from the edge of the disc are not compared
 WIDEST_GAIN = 0.05  # width of the prior of g_n if the images do not show its spread
 LEAST_GAIN = 1e-5  # smallest width of the prior of g_n
@@ -210,8 +211,8 @@ class UnoccultedEquations:
 
 
 def block_px(shape: tuple[int, int]) -> int:
-    """The edge length of a block, px: BLOCK_PX, or less in small images."""
-    return max(1, min(BLOCK_PX, min(shape) // LEAST_BLOCKS))
+    """The edge length of a block, px: BLOCK_PX, less in small images, and more in large ones."""
+    return max(1, min(BLOCK_PX, min(shape) // LEAST_BLOCKS), min(shape) // MOST_BLOCKS)
 
 
 def block_means(plane: NDArray[np.floating], edge: int) -> Matrix:
@@ -224,16 +225,6 @@ def block_means(plane: NDArray[np.floating], edge: int) -> Matrix:
 def blocks(plane: NDArray[np.floating]) -> Vector:
     """The mean of each block of a plane [y, x]: (blocks,)."""
     return block_means(plane, block_px((plane.shape[0], plane.shape[1]))).ravel()
-
-
-def spread_blocks(values: Vector, shape: tuple[int, int]) -> NDArray[np.float32]:
-    """A plane [y, x] of this shape with the value of each block in its pixels (the reverse of `blocks`); 0 in incomplete blocks."""
-    edge = block_px(shape)
-    rows, columns = (n // edge for n in shape)
-    plane = np.zeros(shape, np.float32)
-    each = values.reshape(rows, columns)
-    plane[: rows * edge, : columns * edge] = np.repeat(np.repeat(each, edge, axis=0), edge, axis=1)
-    return plane
 
 
 def not_compared(solution: Solution, n: int) -> NDArray[np.bool_]:

@@ -11,9 +11,16 @@ from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.cells import DiscCells
 from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
-from psfcore.gap.library.detector import EFFECTS
+from psfcore.gap.evidence.tree import SUN
+from psfcore.gap.library.registry import LIBRARY
 
-FEW = tuple(effect for effect in EFFECTS if effect.name in ("dark_offset", "column_smear"))
+FEW = tuple(effect for effect in LIBRARY if effect.name in ("dark_offset", "column_smear"))
+
+
+def with_sun(evidence: Evidence) -> Evidence:
+    """The evidence, with a changing Sun among its effects."""
+    (sun,) = (effect for effect in LIBRARY if effect.name == SUN)
+    return replace(evidence, effects=(*evidence.effects, sun), columns=evidence.columns | {SUN: ()})
 
 
 def discs_only(evidence: Evidence) -> Evidence:

@@ -19,6 +19,7 @@ from psfcore.gap.diagnose import Diagnosis, start_of
 from psfcore.gap.effect import Change, Effect
 from psfcore.gap.evidence.search import displaced
 from psfcore.gap.library.optics import DIRECTIONS, blur_as
+from psfcore.gap.verdict.correction import Corrected
 from psfcore.psf import Psf, cumulative_curve
 from psfcore.scatter.shapes import SHAPES
 from psfcore.scatter.total_psf import TotalPsf
@@ -37,16 +38,22 @@ def _with_small_reach() -> Iterator[None]:
         yield
 
 
+def refit() -> Corrected:
+    added = found().corrected
+    assert added is not None
+    return added
+
+
 def corrected(*effects: Effect, values: tuple[float, ...]) -> Psf:
     """The corrected PSF as if these effects, with these values, had been added to the model."""
     names = [f"{one.name}.{p.name}" for one in effects for p in one.parameters]
     numbers = {name: (value, 0.1, "") for name, value in zip(names, values, strict=True)}
-    added = found().corrected[0]
+    added = refit()
     # The columns are used only for errors; effects that are not in the catalogue have none.
     columns = {one.name: () for one in effects} | added.model.evidence.columns
     model = replace(added.model, evidence=replace(added.model.evidence, columns=columns))
     added = replace(added, effects=effects, values=numbers, model=model)
-    return psf_of(replace(found(), corrected=(added,)))
+    return psf_of(replace(found(), corrected=added))
 
 
 def psf_of(diagnosis: Diagnosis) -> Psf:
@@ -61,7 +68,7 @@ def of_the_answer() -> Psf:
 @cache
 def fitted_kernel() -> np.ndarray:
     """The PSF fitted together with the effect, computed without the effect."""
-    inversion = found().corrected[0].solution.inversion
+    inversion = refit().solution.inversion
     total = TotalPsf(diffraction(), inversion.shape, (REACH_PX, REACH_PX))
     return np.maximum(total.kernel(inversion.coordinates), 0.0)
 
@@ -79,7 +86,7 @@ def test_a_detector_effect_is_not_in_the_psf_and_the_psf_is_closer_to_the_truth(
 
 
 def test_its_file_records_its_origin_and_the_gap_before_and_after(tmp_path: Path) -> None:
-    psf, added = of_the_answer(), found().corrected[0]
+    psf, added = of_the_answer(), refit()
     write_psf(tmp_path / "psf.fits", psf)
     back = read_psf(tmp_path / "psf.fits", FitsLimits(max_pixels=2**23))
     history = "".join(back.provenance["history"]).replace(" ", "")
@@ -119,7 +126,7 @@ def test_effects_of_the_optics_are_in_the_kernel_at_their_place() -> None:
     """To first order it is the true stretched PSF: p is ln(1 + stretch) along x."""
     stretch, plain = 0.02, fitted_kernel()
     psf = corrected(effect("anisotropic_scatter"), values=(float(np.log1p(stretch)), 0.0))
-    values = found().corrected[0].solution.inversion.values
+    values = refit().solution.inversion.values
     at = ScatterTruth(values["b_px"], values["c"], values["total"], stretch=stretch, angle_deg=0.0)
     window = (slice(MIDDLE - 40, MIDDLE + 41),) * 2
     change = (psf.kernel - plain)[window]
@@ -127,7 +134,8 @@ def test_effects_of_the_optics_are_in_the_kernel_at_their_place() -> None:
     assert np.vdot(change, true) / np.vdot(true, true) == pytest.approx(1, abs=0.1)
     assert change[40, 60] > 0 > change[60, 40]  # more along x, less along y
     copy = Change(lambda n, images: displaced(gaussian_filter(images[n], 2.0), 60, -30), unocculted=False)
-    held = replace(effect("ghost"), changes=lambda view: [copy], held=None)
+    ghost = effect("ghost")
+    held = replace(ghost, parameters=ghost.parameters[:1], changes=lambda view: [copy], held=None)
     change = corrected(held, values=(0.03,)).kernel - fitted_kernel()
     row, column = np.unravel_index(int(np.argmax(change)), change.shape)
     assert (row, column) == (MIDDLE - 30, MIDDLE + 60)
@@ -140,5 +148,5 @@ def test_effects_of_the_optics_are_in_the_kernel_at_their_place() -> None:
 
 def test_without_an_answer_there_is_no_corrected_psf() -> None:
     with pytest.raises(DataError, match="got the verdict unknown") as refusal:
-        psf_of(replace(found(), corrected=(), judgement=replace(found().judgement, verdict="unknown")))
+        psf_of(replace(found(), corrected=None, answer=replace(found().answer, verdict="unknown")))
     assert refusal.value.code == "no-answer"

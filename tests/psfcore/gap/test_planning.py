@@ -17,10 +17,10 @@ from psfcore.simulate.plan import HIGH, Plan, default_plan
 from tests.html_page import check_stands_alone, read_page
 from tests.transit_files import diffraction
 
-NAMES = ("dark_offset", "intensity_gradient", "gain_mismatch", "wide_halo", "scene_evolution")
+NAMES = ("dark_offset", "intensity_gradient", "gain_mismatch", "wide_halo")
 FEW = tuple(effect for effect in LIBRARY if effect.name in NAMES)
 ONE, LADDER = (1.8,), (0.6, 1.8, 5.0)
-IMAGES, SIZE_PX = 15, 96  # an effect of the scene needs five images of a pointing
+IMAGES, SIZE_PX = 15, 96
 
 
 def plan_with(exposures_s: Sequence[float], images: int = IMAGES) -> Plan:

@@ -19,7 +19,6 @@ from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
 from psfcore.gap.evidence.search import displaced
 from psfcore.gap.verdict import correction
 from psfcore.gap.verdict.correction import add_to_model, images_without
-from psfcore.gap.verdict.posterior import with_same_data
 from psfcore.gap.view import View
 from psfcore.scatter.reconstruction import Solution
 from psfcore.simulate.plan import default_plan
@@ -59,7 +58,6 @@ def test_a_round_that_leaves_more_than_the_previous_one_is_rejected(monkeypatch:
     assert len(taken_out) == 2 and added.rounds == 1
     assert value == pytest.approx(1.0, abs=4 * sigma)
     assert added.parameters("dark_offset") == {"offset": (value, sigma)}
-    assert added.subtracted["dark_offset"] == pytest.approx((1.0,), abs=4 * sigma)
     # Noise and reference level are those of the images before the subtraction.
     for before, after in zip(model.evidence.discs, added.model.evidence.discs, strict=True):
         assert after.level == before.level
@@ -82,14 +80,11 @@ def test_a_refit_of_several_rounds_computes_the_jacobian_once(monkeypatch: pytes
 
     monkeypatch.setattr(correction, "gather", counted)
     monkeypatch.setattr(correction, "SETTLED", 0.0)
-    offset = effect("dark_offset")
-    added = add_to_model(solution, [plane], fit_effects(model, [plane]), model, beside=[offset])
+    added = add_to_model(solution, [plane], fit_effects(model, [plane]), model)
     assert added.rounds > 1 and len(gathered) == 1
     for name, true in (("level", 4.0), ("slope_x", 8.0), ("slope_y", 0.0)):
         value, sigma, _ = added.values[name]
         assert value == pytest.approx(true, abs=4 * sigma), name
-    assert added.beside is not None
-    assert [e.name for e in added.beside.evidence.effects] == ["intensity_gradient", "dark_offset"]
     alone = gather(added.solution, added.effects)
     assert added.model.evidence.columns == alone.columns and added.model.evidence.size == alone.size
     for made, again in zip(added.model.evidence.discs, alone.discs, strict=True):
@@ -125,30 +120,3 @@ def test_a_subtracted_effect_scales_with_the_brightness_of_the_image() -> None:
     after = gather(fit(images_without(view.solution.transit, view, [copy], np.array([0.4]))), [copy])
     blocks = replace(after.unocculted, variance=before.unocculted.variance)
     assert replace(after, unocculted=blocks).all_unocculted.chi2 < before.all_unocculted.chi2 * 1.02
-
-
-def test_a_refit_is_judged_by_the_data_from_before_it(evidence: Evidence) -> None:
-    """The refit has other blocks, its own order of columns, and lost the first disc; the fit before it could not use the last."""
-    (offset,), smear = evidence.columns["dark_offset"], evidence.columns["column_smear"]
-    own = {"column_smear": (offset, smear[0]), "dark_offset": (smear[1],)}
-    first, *rest = evidence.discs
-    before = replace(evidence, discs=(first, *rest[:-1]))
-    after = replace(
-        evidence,
-        effects=evidence.effects[::-1],
-        columns=own,
-        discs=tuple(rest),
-        unocculted=replace(evidence.unocculted, levels=0.5 * evidence.unocculted.levels),
-    )
-    moved = np.arange(1.0, 1.0 + len(evidence.base))
-    same = with_same_data(before, after, {"dark_offset": (2.0,)}, moved)
-    blocks, change = same.unocculted, evidence.unocculted.errors[offset]
-    np.testing.assert_allclose(blocks.levels, evidence.unocculted.levels - 2.0 * change)
-    np.testing.assert_array_equal(blocks.errors[smear[1]], change)
-    np.testing.assert_array_equal(blocks.variance, evidence.unocculted.variance)
-    assert same.images == before.images
-    change = moved @ first.jacobian[list(evidence.base)] + 2.0 * first.jacobian[offset]
-    np.testing.assert_allclose(same.discs[0].residual, first.residual - change)
-    np.testing.assert_array_equal(same.discs[0].jacobian[smear[1]], first.jacobian[offset])
-    np.testing.assert_array_equal(same.discs[0].jacobian[offset], first.jacobian[smear[0]])
-    assert same.discs[1:] == before.discs[1:]
