@@ -2,9 +2,9 @@
 Is the gap real?
 ================
 
-A fitted PSF never reproduces a transit exactly. The *gap* is the part of the residuals that noise does not explain. The gap diagnosis
-states which physical effect could cause it, with a probability. This tutorial adds a known error to a simulated transit
-and reads the diagnosis.
+A fitted PSF never reproduces a transit exactly. The *gap* is the part of the residuals that noise does not explain. The gap
+diagnosis states where the gap lies, which cause explains it, and how far it shrinks with this cause in the model. This tutorial
+adds a known error to a simulated transit and reads the diagnosis.
 """
 
 from pathlib import Path
@@ -36,24 +36,28 @@ write(simulate(plan, ScatterTruth(b_px=6.15, c=2.53, total=0.411), diffraction, 
 # The diagnosis
 # -------------
 #
-# Begin with the sentence and the cautions of the report.
+# Begin with the three lines and the cautions of the report.
 
 gap = heliopsf.diagnose_gap(folder)
 report = gap.report()
-print(report["sentence"])
+print("\n".join(report["lines"]))
 print(report["cautions"] or "No cautions.")
 
 # %%
-# The verdict and the answer set
-# ------------------------------
+# The causes
+# ----------
 #
-# The answer set contains the hypotheses that the data do not exclude. Each hypothesis is a list of effects; an empty list
-# means that there is no gap. On transits like those of the calibration, the set contains the true cause with a probability
-# of 90 % (``coverage``).
+# The report lists the causes that act together; here there is one. Each cause has one or more alternatives: one of them is the
+# cause. An alternative is an effect of the library, or another form of a family: a change of this kind whose form the library
+# does not have. The *level* of a cause says what is sure: the name of an effect, a family, a stage (scene, optics or detector),
+# or none of these (``open``). On transits like those of the calibration, the alternatives contain a true cause with a
+# probability of 90 % (``coverage``).
 
-print("verdict: ", report["verdict"])
-print("answer:  ", report["answer"])
-print("set:     ", report["set"])
+print("verdict:", report["verdict"])
+for cause in report["causes"]:
+    print("level:  ", cause["level"])
+    for one in cause["alternatives"]:
+        print(f"  {one['words']} ({one['stage']}, family {one['family']}): {one['probability']:.3f}")
 
 # %%
 # The figure shows the effects with the highest probabilities. The bars show the closure: the share of the gap in held-out
@@ -64,19 +68,21 @@ figure, axes = plt.subplots(figsize=(8, 5), layout="constrained")
 gap.plot(axes)
 
 # %%
-# The report states the size of each effect with its error.
+# The report states the size of each effect with its error, and the closure with its 90 % interval. The interval is wide here,
+# because the gap is only twice the noise.
 
 best = report["effects"][0]
 offset = best["parameters"]["offset"]
-print(f"{best['name']}: {offset['value']:.2f} ± {offset['sigma']:.2f} {offset['unit']}")
-print(f"closure on held-out images: {best['closure']['value']:.2f}")
+print(f"{best['words']}: {offset['value']:.2f} ± {offset['sigma']:.2f} {offset['unit']}")
+low, high = report["closure"]["ci90"]
+print(f"closure on held-out images: {report['closure']['value']:.2f} ({low:.2f} to {high:.2f})")
 
 # %%
 # What these data could have shown
 # --------------------------------
 #
-# An effect that is not in the answer may act, but too weakly to be seen. ``found_90`` is the strength that would be found
-# in 90 % of observations; ``excluded_95`` is the strength above which these data exclude the effect.
+# An effect that is not told may act, but too weakly to be seen. ``found_90`` is the strength with which the effect excludes
+# "no cause" in 90 % of observations; ``excluded_95`` is the strength above which these data exclude the effect.
 
 print(f"{'effect':20} {'found_90':>10} {'excluded_95':>12}")
 for name in ("dark_offset", "intensity_gradient", "column_smear", "ghost"):
@@ -95,4 +101,6 @@ for name in ("dark_offset", "intensity_gradient", "column_smear", "ghost"):
 #   writes a PSF that was fitted with the effect in the model.
 # - ``tie``: ``report["would_separate"]`` names the observation that would separate the effects.
 # - ``none``: no gap was found. The limits state how strong an effect can still be.
-# - ``unknown`` or ``inconclusive``: see :doc:`the gap diagnosis </gap>`, which also states how often the diagnosis is right.
+# - ``unknown`` or ``inconclusive``: at least one alternative is a form that the library does not have. ``report["causes"]``
+#   has its family, and where possible a map or a curve of it; see :doc:`the gap diagnosis </gap>`, which also states how often
+#   the diagnosis is right. :doc:`Two real transits </real_transits>` shows what can be said without a diagnosis.

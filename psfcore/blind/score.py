@@ -64,7 +64,6 @@ COMPARABLE = {
     "ghost": ("share", 1.0),
     "wide_halo": ("share", 1.0),
     "mesh_rotation": ("angle", 1.0),
-    "mesh_pitch": ("stretch", 100.0),
 }
 
 Row = dict[str, Any]

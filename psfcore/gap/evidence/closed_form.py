@@ -21,7 +21,7 @@ eliminated block by block, so N with the Sun in the model costs one product of m
 
 **Errors of form.** No linear column is exact. If the change by the most probable causes is so strong that a relative error
 FORM_ERROR of it would be visible, this error joins the noise: common to the cells of a disc, or the blocks of an image, and
-for each cell and block on its own. It is the same for all hypotheses.
+for each cell and block on its own. In the blocks, the square of a relative change joins it too. It is the same for all hypotheses.
 
 **Noise.** If the best causes leave more chi2 than noise does, the variance of the noise of the discs, and that of the blocks, is raised
 to this ratio (Birge 1932, Phys. Rev. 40, 207).
@@ -128,8 +128,11 @@ class Inexact:
     variants: tuple[Variant, ...]
     values: Vector
 
-    def change(self, design: Matrix, numbers: Columns) -> Matrix:
-        """The error of form of a change. design: (..., columns). numbers: of its columns; other columns are 0 there."""
+    def change(self, design: Matrix, numbers: Columns, level: Matrix) -> Matrix:
+        """The error of form of a change: FORM_ERROR of it, and its square relative to the light, which the first order neglects.
+
+        design: (..., columns). numbers: of its columns; other columns are 0 there. level: the light (...).
+        """
         place = {number: k for k, number in enumerate(numbers.tolist())}
         columns = np.concatenate([one.columns for one in self.variants]).tolist()
         shown = [
@@ -138,7 +141,8 @@ class Inexact:
             if column in place
         ]
         at, values = [k for k, _ in shown], [value for _, value in shown]
-        return np.asarray(FORM_ERROR * (design[..., at] @ np.array(values)))
+        change = np.asarray(design[..., at] @ np.array(values))
+        return np.asarray(change * np.hypot(FORM_ERROR, change / np.maximum(level, 1e-9)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,7 +246,7 @@ class ClosedForm:
         )
         if self._inexact is not None:
             change, ends = (
-                self._inexact.change(whole, np.arange(self._size)),
+                self._inexact.change(whole, np.arange(self._size), np.full(len(whole), np.inf)),
                 np.cumsum([0, *(disc.residual.size for disc in model.discs)]),
             )
             change = change - whole[:, :base] @ np.linalg.lstsq(whole[:, :base], change, rcond=None)[0]
@@ -276,7 +280,7 @@ class ClosedForm:
                 np.zeros(blocks.levels[here].shape),
             )
             if self._inexact is not None:
-                change = self._inexact.change(columns, self._in_blocks)
+                change = self._inexact.change(columns, self._in_blocks, blocks.means[here])
             weight = np.where(blocks.free[here], 1 / (variance + change**2), 0.0)
             use = (weight > 0).sum(axis=0) >= LEAST_IMAGES
             if not use.any():

@@ -10,6 +10,7 @@ the change depends on place, time, pointing, or kind of image. A column is one c
 | gain | E_n(x) b(x) |
 | kernel | scene * k(r) times 1, cos a, sin a, cos 2a, sin 2a: a change of the PSF |
 | ring | the same without the factors of the azimuth |
+| | kernel and ring have one more form: a wider core, the mean of the neighbouring boxes minus the box |
 | tilted_kernel | x or y times (scene * k(r)) |
 | scatter | (b(x) scene) * k(r): more or less scatter of the light of a place |
 | outside | light of b(side) beside the field, convolved with the PSF |
@@ -60,6 +61,7 @@ RINGS_OF_PLACES = {
     WIDTHS[1]: 2,
     WIDTHS[2]: 3,
 }  # how many radii `scatter` distinguishes, by the width of its bumps
+LARGEST_SQUARE = WIDTHS[1]  # width of the bumps whose squares are places on the detector
 OUTSIDE_BOXES = 8  # how far light beside the field extends
 SIDES = 3  # bumps on each side of the field
 IN_TIME = WIDTHS[-1]  # width in time of the bumps of fields that also change with place, or with the radius
@@ -137,6 +139,7 @@ class FieldColumns:
         if (
             field.width is None
             or field.modulation not in ("place", "pointing")
+            or field.width > LARGEST_SQUARE
             or field.operator == "outside"
         ):
             return []
@@ -152,6 +155,9 @@ class FieldColumns:
             return np.ones((len(infos), 1))
         if field.modulation == "pointing":
             return np.array([[float(info.pointing == field.pointing)] for info in infos])
+        if field.modulation == "pointings":
+            every = sorted({info.pointing for info in infos})
+            return np.array([[float(info.pointing == one) for one in every] for info in infos])
         if field.modulation == "kind":
             kinds = [(info.exposure_s, info.gain_mode) for info in infos]
             return np.array([[float(kind == one) for one in dict.fromkeys(kinds)] for kind in kinds])
@@ -200,7 +206,9 @@ class FieldColumns:
             return self._size(operator) * _patterns(*self.at, width)
         scene = self._size(operator) * scene
         if operator == "kernel":
-            return np.array([kernel.apply(scene) for kernel in self._kernels], dtype=np.float64)
+            return np.array(
+                [*(kernel.apply(scene) for kernel in self._kernels), _core(scene)], dtype=np.float64
+            )
         rings = self._kernels[:: len(_FACTORS)]
         if operator == "scatter":
             assert width is not None
@@ -209,7 +217,9 @@ class FieldColumns:
             return np.array([rings[k].apply(one) for one in weighted for k in chosen], dtype=np.float64)
         changed = np.array([ring.apply(scene) for ring in rings], dtype=np.float64)
         y, x = self.at
-        return changed if operator == "ring" else np.concatenate([changed * x, changed * y[:, None]])
+        if operator == "ring":
+            return np.concatenate([changed, _core(scene)[None]])
+        return np.concatenate([changed * x, changed * y[:, None]])
 
     @cached_property
     def _scenes(self) -> dict[int, Matrix]:
@@ -287,10 +297,13 @@ class FieldColumns:
         if field.operator == "kernel":
             axes = ("radius_px",)
             at = np.array([[edge * 2.0**octave] for octave in self.octaves.tolist()], dtype=np.float64)
-            of_forms = np.asarray(np.kron(self._rings.T, np.eye(1, len(_FACTORS))), dtype=np.float64)
+            of_rings = np.kron(self._rings.T, np.eye(1, len(_FACTORS)))
+            of_forms = np.asarray(np.pad(of_rings, ((0, 0), (0, 1))), dtype=np.float64)
         elif field.operator == "ring" or (field.modulation == "time" and field.operator != "tilted_kernel"):
             axes, at = ("time_s",), np.array([[info.time_s] for info in self._infos])
-            of_forms, now = np.ones((1, forms)) if optics else np.eye(1, forms), weight
+            of_forms, now = np.eye(1, forms), weight
+            if optics:
+                of_forms = np.append(np.ones((1, forms - 1)), [[0.0]], axis=1)
         elif field.operator not in ("edge", "outside") and field.modulation != "kind":
             patterns = _patterns(y, x, field.width_of_forms)[int(field.operator == "tilted_kernel") :]
             of_forms = np.repeat(patterns, forms // len(patterns), axis=0).reshape(forms, -1).T
@@ -406,6 +419,13 @@ def with_effect(evidence: Evidence, effect: Effect, discs: Planes, blocks: Plane
         discs=tuple(replace(disc, jacobian=one) for disc, one in zip(evidence.discs, jacobians, strict=True)),
         unocculted=replace(evidence.unocculted, errors=errors),
     )
+
+
+def _core(scene: Matrix) -> Matrix:
+    """The change by a wider core of the PSF: the mean of the four neighbouring boxes minus the box. It moves light by less than a ring."""
+    wide = np.pad(scene, 1, mode="edge")
+    around = wide[:-2, 1:-1] + wide[2:, 1:-1] + wide[1:-1, :-2] + wide[1:-1, 2:]
+    return np.asarray(around / 4 - scene)
 
 
 def bumps(at: Sequence[float] | Vector, width: float) -> Matrix:

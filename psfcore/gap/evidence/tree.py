@@ -125,9 +125,10 @@ def fields_of(pointings: Sequence[int], *, exposures: bool, kinds: bool) -> list
         widths = WIDTHS[1:] if operator == "gain" else WIDTHS[2:]
         found += [Field(f"{operator}_place_time", operator, "place_time", width) for width in widths]
     for pointing in pointings:
-        found.append(Field("outside", "outside", "pointing", None, pointing))
         if len(pointings) > 1:
+            found.append(Field("outside", "outside", "pointing", None, pointing))
             found += [Field("light_pointing", "light", "pointing", width, pointing) for width in WIDTHS]
+    found.append(Field("outside", "outside", "pointings"))
     if kinds:
         found.append(Field("gain_kind", "gain", "kind"))
     found += [

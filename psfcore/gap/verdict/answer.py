@@ -5,7 +5,8 @@ the Sun always may change. Their prior: NONE, ONE and TWO; families are equally 
 weight belongs to the effects of the library and half to the fields.
 
 **Two priors of the Sun.** In the first, the blocks change independently. In the second, the Sun also changes the brightness of large
-areas, like a gain that changes with place and time. The probability of a hypothesis is the mean over both; where
+areas, like a gain that changes with place and time, and the edges of the discs, because it changes the places at which the occulters
+are found. The probability of a hypothesis is the mean over both; where
 they disagree, the answer is the tie "the Sun, or an instrument that changes with time".
 
 **Detection.** A gap is detected if something is more than FLOOR times as probable as no cause. Otherwise there is no cause in the answer.
@@ -72,7 +73,8 @@ LEADING, OF_LIBRARY = (
 )  # forms that are weighed in pairs: the most probable ones, and those of the library
 FIRST_OF_PAIR = 5  # one form of a pair is among this number of most probable forms
 TRIPLES = 4  # the best pairs, beside which the Sun is weighed
-COHERENT = ("gain_time", "gain_place_time")  # families by which the Sun changes large areas
+# Families that the Sun causes beside the changes of the blocks: it changes large areas, and the place where an occulter is found.
+COHERENT = ("gain_time", "gain_place_time", "core", "edge", "edge_time")
 UNKNOWN = "unknown"
 
 
