@@ -141,7 +141,7 @@ def diagnose_gap(
     transit, noise, saturation_dn, seed, threads, progress
         As in ``fit_scatter``, which raises the same errors.
     coverage : float
-        The probability with which the answer set contains the true cause.
+        The probability of the alternatives of each cause together: with a larger one more alternatives are told.
 
     Returns
     -------

@@ -35,7 +35,7 @@ from psfcore.gap.evidence.closed_form import ClosedForm, Form
 from psfcore.gap.evidence.columns import FieldColumns
 from psfcore.gap.evidence.evidence import gather
 from psfcore.gap.evidence.linear_model import LinearModel
-from psfcore.gap.evidence.tree import family_of
+from psfcore.gap.evidence.tree import FAMILIES
 from psfcore.gap.library.registry import LIBRARY
 from psfcore.gap.verdict.answer import NONE, ONE, Labels, causes_of, label_of, prior_of
 from psfcore.scatter.inversion import invert
@@ -86,7 +86,7 @@ def _true_effect(number: int, cause: TrueCause, without: Transit) -> Effect:
 
     return Effect(
         f"true_{number}",
-        family_of(cause.families[0]).stage,
+        FAMILIES[cause.families[0]].stage,
         (EffectParameter("strength", "", 1.0),),
         "",
         "",
@@ -130,7 +130,7 @@ def _bound(
     whole = np.concatenate([np.full((1, DRAWS), np.log(NONE)), weights])
     shares = np.exp(whole - logsumexp(whole, axis=0))
     right = {"name": 0, "family": 0, "stage": 0}
-    detected, stages = 0, {family_of(family).stage for family in cause.families}
+    detected, stages = 0, {FAMILIES[family].stage for family in cause.families}
     for draw in shares.T:
         by_label: dict[Labels, float] = {frozenset(): float(draw[0])}
         for form, share in zip(known, draw[1:], strict=True):

@@ -168,6 +168,8 @@ def diagnose(
     closing = _Closing(held_out, schemes, rng, model.scale_error, exists=bool(answer.causes))
     shrinking = {name: closing.of(fit.model, fit)[0] for name, fit in fits.items()}
     of_told, after = (None, None) if told is None else closing.of(told.model, told, corrected)
+    if told is not None and of_told is not None and told.label in shrinking:
+        shrinking[told.label] = of_told
     before = held_out[0]
     rms = gap(before.residual_pct, before.noise_pct, rng) if before is not None else Interval(0.0, 0.0, 0.0)
     cautions = [*cautions_of(solution, noise, model.evidence), *failures]

@@ -226,7 +226,7 @@ def diagnose(
 
 def _next_step(report: dict[str, Any], transit: str, page: Path | None, corrected: Path | None) -> str:
     """What to do with this verdict, in one line; empty if there is nothing to do."""
-    if report["verdict"] in ("attributed", "tie") and corrected is None:
+    if report["psf"]["with_answer"] is not None and corrected is None:
         return f"`heliopsf gap {transit} --corrected PSF.fits` writes the PSF without the effect"
     if report["verdict"] in ("inconclusive", "tie"):
         return "`heliopsf gap plan PLAN` tells whether images that are not taken yet would decide"

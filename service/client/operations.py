@@ -205,7 +205,7 @@ class Operations(ABC):
         """Upload a transit, diagnose the gap between it and the fitted model, and download the report; returns its description.
 
         report, page, preview: as for ``report``. options: ``progress``, ``overwrite`` and ``noise`` as for ``deconvolve``,
-        ``psf_id`` of a fitted PSF to start from, ``seed``, ``coverage`` of the answer set, ``correct`` (whether to make the
+        ``psf_id`` of a fitted PSF to start from, ``seed``, ``coverage`` of the answer, ``correct`` (whether to make the
         corrected PSF). If an effect was found, ``details.corrected_psf_id`` is the id of the corrected PSF.
         """
         files = {"file": report, "preview": preview, "html": page}

@@ -357,7 +357,7 @@ class GapDiagnose(Parameters):
     """Diagnose the gap between an uploaded transit and the model that was fitted to it. The report says how large the gap is,
     where in the data it appears, and which effects explain it."""
 
-    algorithm_version: ClassVar[int] = 16
+    algorithm_version: ClassVar[int] = 17
     transit_id: TransitId
     psf_id: Identity | None = Field(
         None,
@@ -370,7 +370,7 @@ class GapDiagnose(Parameters):
         0.9,
         ge=0.5,
         le=0.95,
-        description="probability with which the answer set contains the true cause, for transits like the simulated ones of the calibration",
+        description="probability of the alternatives of each cause together: with a larger one more alternatives are told",
     )
     correct: bool = Field(
         True,

@@ -43,7 +43,7 @@ from scipy.special import log_ndtr, logsumexp
 from psfcore.arrays import scaled_inverse
 from psfcore.gap.evidence.columns import LIKELY, FieldColumns
 from psfcore.gap.evidence.linear_model import WEAKEST, LinearModel
-from psfcore.gap.evidence.tree import SUN, Field, fields_of
+from psfcore.gap.evidence.tree import SUN, Field, family_of, fields_of
 from psfcore.gap.evidence.unocculted_blocks import LEAST_IMAGES
 
 Vector = NDArray[np.float64]
@@ -202,7 +202,7 @@ class ClosedForm:
             likely = np.array([parameter.likely for _, parameter in pairs])
             positive = np.array([parameter.positive for _, parameter in pairs], np.bool_)
             templates = math.log(max(evidence.templates.get(effect.name, 1.0), 1.0))
-            family = effect.family or effect.name
+            family = family_of(effect)
             found.append(Form(family, effect.name, None, numbers, likely, positive, log_templates=templates))
         names = {effect.name for effect in evidence.effects}
         for field, span in self.spans.items():

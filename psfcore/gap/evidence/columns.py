@@ -43,7 +43,7 @@ from numpy.typing import NDArray
 from psfcore.convolution.convolver import Convolver, linear_convolve
 from psfcore.gap.effect import Change, Effect, EffectParameter
 from psfcore.gap.evidence.evidence import Evidence
-from psfcore.gap.evidence.tree import WIDTHS, Field, family_of
+from psfcore.gap.evidence.tree import FAMILIES, WIDTHS, Field
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -268,7 +268,7 @@ class FieldColumns:
             plane = np.pad(plane, short, mode="edge")
             return np.asarray(plane * image if field.operator == "gain" else plane, dtype=np.float32)
 
-        family = family_of(field.family)
+        family = FAMILIES[field.family]
         return Effect(
             another(field.family),
             family.stage,

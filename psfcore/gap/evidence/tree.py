@@ -13,11 +13,12 @@ forms are the effects of the library that belong to it, and its free fields: sum
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from psfcore.gap.effect import Stage
+from psfcore.gap.effect import Effect, Stage
 
+STAGES: tuple[Stage, ...] = ("scene", "optics", "detector")
 SUN = "scene_evolution"  # the effect that is the changing Sun
 WIDTHS = (0.2, 0.4, 0.8)  # of a bump, in units of half the detector or half the duration
 SPOT = 0.1  # width of the bumps of a change at one place
@@ -65,6 +66,7 @@ FAMILIES: dict[str, Family] = {
         Family("edge_time", "scene", "light in front of the occulter that changes with time", "the occulter off the Sun", ("time", *_DISC)),
         Family("outside", "scene", "light from outside the field", "full-Sun images taken at the same time", ("scattering_distance", "pointing", "intensity")),
         Family("light_pointing", "scene", "light added in one pointing", "an exposure with the door closed at each pointing", ("pointing", *_PLACE)),
+        *(Family(f"other_{stage}", stage, f"another change of the {stage}", "", ()) for stage in STAGES),
         Family("sun", "scene", "a changing Sun", "images that are closer together in time", ("time", "pointing")),
     )
 }  # fmt: skip
@@ -145,6 +147,12 @@ def fields_of(pointings: Sequence[int], *, exposures: bool, kinds: bool) -> list
     return [*found, Field("edge", "edge", "constant"), Field("edge_time", "edge", "time", WIDTHS[-1])]
 
 
-def family_of(name: str) -> Family:
-    """The family of this name; for an added effect without a family, one of its own."""
-    return FAMILIES.get(name) or Family(name, "detector", name.replace("_", " "), "", ())
+def family_of(effect: Effect) -> str:
+    """The name of the family of an effect; for an added effect without a family, that of other changes at its stage."""
+    return effect.family or f"other_{effect.stage}"
+
+
+def listed(observations: Iterable[str]) -> str:
+    """Observations as text, each once."""
+    each = (part for one in observations for part in one.split(", or "))
+    return "; or ".join(dict.fromkeys(filter(None, each)))

@@ -20,6 +20,7 @@ import numpy as np
 
 from psfcore.gap.effect import Change, Effect
 from psfcore.gap.effect_sources import bad_effects, sha256_of_source
+from psfcore.gap.evidence.tree import FAMILIES
 from psfcore.gap.library import detector, optics, scene
 from psfcore.gap.view import Field, View
 from psfcore.user_code import is_file, module_in_file, named_errors
@@ -73,6 +74,11 @@ def _added(source: str) -> Added:
         if not effect.name.isidentifier():
             raise bad_effects(
                 source, f"expected an effect name of letters, digits and _; got {effect.name!r:.60}"
+            )
+        if effect.family and effect.family not in FAMILIES:
+            raise bad_effects(
+                source,
+                f"{effect.name}: expected a family of {', '.join(FAMILIES)}; got {effect.family!r:.60}",
             )
         if not effect.parameters:
             raise bad_effects(source, f"{effect.name}: expected at least one parameter; got none")

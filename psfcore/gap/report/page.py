@@ -13,7 +13,7 @@ from typing import Any
 from psfcore.drawing.page import DASH, render, with_error
 from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.evidence.linear_model import FLOOR
-from psfcore.gap.evidence.tree import family_of
+from psfcore.gap.evidence.tree import FAMILIES
 from psfcore.gap.report import limits, plot
 from psfcore.gap.report import report as texts
 from psfcore.gap.report.report import (
@@ -86,7 +86,7 @@ def cause_rows(report: Report) -> list[Row]:
             str(number),
             one["words"],
             one["stage"],
-            family_of(one["family"]).words,
+            FAMILIES[one["family"]].words,
             percent_words(one["probability"]),
         ]
         for number, cause in enumerate(report["causes"], 1)

@@ -15,7 +15,7 @@ from scipy.special import chdtrc
 from psfcore.gap.diagnose import Diagnosis, Shrinking
 from psfcore.gap.evidence.columns import FieldShape, another
 from psfcore.gap.evidence.effect_fits import EffectFit, left_chi2
-from psfcore.gap.evidence.tree import SUN, family_of
+from psfcore.gap.evidence.tree import FAMILIES, SUN, family_of, listed
 from psfcore.gap.verdict.answer import LEAST_IMAGES, Alternative, Cause
 from psfcore.gap.verdict.closure import HeldOut, Interval
 from psfcore.gap.verdict.where import SIGNIFICANT
@@ -51,7 +51,7 @@ def gap_report(found: Diagnosis) -> dict[str, Any]:
     return {
         "schema": SCHEMA,
         "lines": lines,
-        "sentence": " ".join(line.partition(": ")[2] for line in lines),
+        "sentence": _sentence(lines),
         "gap": {
             "before_refit_pct": found.before_refit.to_json(),
             "rms_pct": found.rms.to_json(),
@@ -74,7 +74,7 @@ def gap_report(found: Diagnosis) -> dict[str, Any]:
         "probabilities": {"none": answer.none, **_probabilities(found)},
         "limits": stated["limits"],
         "alike": stated["alike"],
-        "calibration": found.calibration.to_json(),
+        "calibration": found.calibration.to_json(answer.level),
         "effects": [_fit(found, fit, found.shrinking[name]) for name, fit in found.fits.items()],
         "together": [_fit(found, found.told, found.shrinking_of_told)] if several and found.told else [],
         "untestable": [{"name": name, "why": why} for name, why in found.evidence.untestable.items()],
@@ -94,6 +94,12 @@ def gap_report(found: Diagnosis) -> dict[str, Any]:
         "images": _images(found),
         "inputs_sha256": found.solution.transit.sha256,
     }
+
+
+def _sentence(lines: Sequence[str]) -> str:
+    """The three lines as sentences."""
+    where, which, how_far = (line.partition(": ")[2] for line in lines)
+    return f"{where[0].upper()}{where[1:]} Cause: {which} {how_far[0].upper()}{how_far[1:]}"
 
 
 def _label(family: str, effect: str | None) -> dict[str, Any]:
@@ -239,7 +245,7 @@ def would_separate(found: Diagnosis) -> str:
         if len(cause.alternatives) > 1
         for one in cause.alternatives
     ]
-    return "; or ".join(dict.fromkeys(filter(None, observations)))
+    return listed(observations)
 
 
 # --- the three lines --------------------------------------------------------------------------------------
@@ -393,7 +399,7 @@ def _closure_words(closure: Interval) -> str:
 
 def cause_names(told: EffectFit) -> str:
     """The told causes as text."""
-    causes = {effect.name: effect.family for effect in told.model.evidence.effects}
+    causes = {effect.name: family_of(effect) for effect in told.model.evidence.effects}
     return " with ".join(
         label_words(causes[name], None if name == another(causes[name]) else name) for name in told.names
     )
@@ -401,7 +407,7 @@ def cause_names(told: EffectFit) -> str:
 
 def label_words(family: str, effect: str | None) -> str:
     """A label as text."""
-    return Alternative(family_of(family), effect, 0.0).words
+    return Alternative(FAMILIES[family], effect, 0.0).words
 
 
 def cause_words(cause: Cause, numbers: str = "") -> str:

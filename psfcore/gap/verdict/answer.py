@@ -51,7 +51,7 @@ from psfcore.gap.evidence.closed_form import (
     Variant,
 )
 from psfcore.gap.evidence.linear_model import LinearModel
-from psfcore.gap.evidence.tree import Family, family_of
+from psfcore.gap.evidence.tree import FAMILIES, Family
 
 Verdict = Literal["none", "attributed", "tie", "unknown", "inconclusive"]
 Level = Literal["name", "family", "stage", "open"]
@@ -404,7 +404,7 @@ def _settled(shares: Mapping[Labels, float]) -> dict[Labels, float]:
 
 def _alternative(label: Label, share: float) -> Alternative:
     family, effect = label
-    return Alternative(family_of(family), effect, min(share, 1.0))
+    return Alternative(FAMILIES[family], effect, min(share, 1.0))
 
 
 def _verdict(causes: Collection[Cause], images: int) -> tuple[Verdict, tuple[str, ...]]:

@@ -7,7 +7,9 @@ contains a true cause: the smallest `level` of `answer.causes_of` whose causes c
 
 For a further case that is drawn like the simulated ones, the answer contains a true cause with at least this probability
 (split-conformal prediction; Vovk, Gammerman & Shafer 2005). No such guarantee holds for the effects of another author without a
-bound on how much they differ. The level is never below the coverage, and at most MOST, because a group at a level of 1 is endless.
+bound on how much they differ. The level is never below the coverage. If too many answers miss the true cause at every level up to
+MOST, no level has the coverage: then the level is the coverage itself, because larger groups only add wrong alternatives. `covered`
+states what the cases gave.
 """
 
 from __future__ import annotations
@@ -47,11 +49,16 @@ class Calibration:
                 f"expected a coverage above 0 and at most {count / (count + 1):.3f}, for which {count} simulated cases are "
                 f"enough; got {coverage:g}",
             )
-        return min(max(sorted(self.levels)[rank - 1], coverage), max(MOST, coverage))
+        found = sorted(self.levels)[rank - 1]
+        return coverage if found > MOST else max(found, coverage)
 
-    def to_json(self) -> dict[str, Any]:
-        """For the gap report: how many cases, how they were made, and for which data the coverage holds."""
-        return {"cases": len(self.levels), **self.about}
+    def covered(self, level: float) -> float:
+        """The fraction of the simulated cases whose answer contains a true cause at this level."""
+        return sum(one <= level for one in self.levels) / len(self.levels)
+
+    def to_json(self, level: float) -> dict[str, Any]:
+        """For the gap report: how many cases, what they gave at this level, and how they were made."""
+        return {"cases": len(self.levels), "covered": self.covered(level), **self.about}
 
 
 @cache

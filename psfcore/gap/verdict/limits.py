@@ -32,6 +32,7 @@ from scipy.special import logsumexp, ndtr, ndtri
 
 from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.closed_form import ClosedForm, Form, Variant
+from psfcore.gap.evidence.tree import listed
 from psfcore.gap.verdict.answer import FLOOR, NONE, ONE, prior_of
 
 Vector = NDArray[np.float64]
@@ -167,7 +168,7 @@ def limits(closed: ClosedForm, beside: Sequence[Variant] = (), *, observed: bool
         effects[effect.name] = EffectLimits(tuple(rows))
     distances = _distances(closed, {name: own[name] for name in effects}, effects)
     alike = (
-        Alike(pair, distance, "; or ".join(dict.fromkeys(settled_by[name] for name in pair)))
+        Alike(pair, distance, listed(settled_by[name] for name in pair))
         for pair, distance in distances.items()
         if distance < ALIKE
     )

@@ -65,7 +65,8 @@ def test_the_effects_of_the_library_and_two_groups_of_others_with_the_families_o
     assert set(KNOWN) == {effect.name for effect in LIBRARY}
     assert all(len(names) >= 8 for names in WITHHELD.values())
     assert sorted([*KNOWN, *WITHHELD["calibration"], *WITHHELD["test"]]) == sorted(EFFECTS)
-    assert {name: family.stage for name, family in FAMILIES.items()} == STAGES
+    stages = {name: family.stage for name, family in FAMILIES.items() if not name.startswith("other_")}
+    assert stages == STAGES
     truths = {name: kind.drawn(plan, np.random.default_rng(1)).as_json() for name, kind in EFFECTS.items()}
     assert {truths[name]["stage"] for name in WITHHELD["test"]} == {"scene", "optics", "detector"}
     assert {name for name, truth in truths.items() if truth["cause"] == name} == set(KNOWN)
