@@ -128,11 +128,8 @@ class Inexact:
     variants: tuple[Variant, ...]
     values: Vector
 
-    def change(self, design: Matrix, numbers: Columns, level: Matrix) -> Matrix:
-        """The error of form of a change: FORM_ERROR of it, and its square relative to the light, which the first order neglects.
-
-        design: (..., columns). numbers: of its columns; other columns are 0 there. level: the light (...).
-        """
+    def change(self, design: Matrix, numbers: Columns) -> Matrix:
+        """The change by these causes. design: (..., columns). numbers: of its columns; other columns are 0 there."""
         place = {number: k for k, number in enumerate(numbers.tolist())}
         columns = np.concatenate([one.columns for one in self.variants]).tolist()
         shown = [
@@ -141,8 +138,7 @@ class Inexact:
             if column in place
         ]
         at, values = [k for k, _ in shown], [value for _, value in shown]
-        change = np.asarray(design[..., at] @ np.array(values))
-        return np.asarray(change * np.hypot(FORM_ERROR, change / np.maximum(level, 1e-9)))
+        return np.asarray(design[..., at] @ np.array(values))
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,14 +203,13 @@ class ClosedForm:
         names = {effect.name for effect in evidence.effects}
         for field, span in self.spans.items():
             one_sign = np.zeros(len(span), np.bool_)
-            name = field.effect if field.effect in names else None
             squares = tuple(self.columns.squares(field))
             likely = np.full(len(span), LIKELY)
             numbers = np.array(span, dtype=np.intp)
             found.append(
                 Form(
                     field.family,
-                    name,
+                    None,
                     field,
                     numbers,
                     likely,
@@ -245,11 +240,10 @@ class ClosedForm:
             else self._draws[0]
         )
         if self._inexact is not None:
-            change, ends = (
-                self._inexact.change(whole, np.arange(self._size), np.full(len(whole), np.inf)),
-                np.cumsum([0, *(disc.residual.size for disc in model.discs)]),
-            )
+            change = self._inexact.change(whole, np.arange(self._size))
             change = change - whole[:, :base] @ np.linalg.lstsq(whole[:, :base], change, rcond=None)[0]
+            change *= FORM_ERROR
+            ends = np.cumsum([0, *(disc.residual.size for disc in model.discs)])
             for start, end in itertools.pairwise(ends):
                 own = change[start:end]
                 lower = np.linalg.cholesky(np.eye(own.size) + np.outer(own, own) + np.diag(own**2))
@@ -280,7 +274,11 @@ class ClosedForm:
                 np.zeros(blocks.levels[here].shape),
             )
             if self._inexact is not None:
-                change = self._inexact.change(columns, self._in_blocks, blocks.means[here])
+                # The scene absorbs what all images share.
+                change = self._inexact.change(columns, self._in_blocks)
+                seen = np.where(blocks.free[here], 1 / variance, 0.0)
+                change -= (seen * change).sum(axis=0) / np.maximum(seen.sum(axis=0), 1e-300)
+                change *= np.hypot(FORM_ERROR, change / np.maximum(blocks.means[here], 1e-9))
             weight = np.where(blocks.free[here], 1 / (variance + change**2), 0.0)
             use = (weight > 0).sum(axis=0) >= LEAST_IMAGES
             if not use.any():

@@ -14,7 +14,7 @@ the change depends on place, time, pointing, or kind of image. A column is one c
 | tilted_kernel | x or y times (scene * k(r)) |
 | scatter | (b(x) scene) * k(r): more or less scatter of the light of a place |
 | outside | light of b(side) beside the field, convolved with the PSF |
-| edge | E times 1 and the patterns of `DiscCells.patterns`, in the discs alone |
+| edge | E and R times 1 and the patterns of `DiscCells.patterns`, in the discs alone; R is the scene around the disc |
 
 L is the mean light of the discs, DN/s; t_n is the exposure time and 1 / T the mean of 1 / t_n; E_n is the expected image; r and
 a are the radius and the azimuth in the PSF; * is the convolution. Bumps are Gaussians on a grid, of the width w in units of half
@@ -42,6 +42,7 @@ from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import Convolver, linear_convolve
 from psfcore.gap.effect import Change, Effect, EffectParameter
+from psfcore.gap.evidence.cells import DiscCells
 from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.tree import FAMILIES, WIDTHS, Field
 
@@ -62,6 +63,9 @@ RINGS_OF_PLACES = {
     WIDTHS[2]: 3,
 }  # how many radii `scatter` distinguishes, by the width of its bumps
 LARGEST_SQUARE = WIDTHS[1]  # width of the bumps whose squares are places on the detector
+EDGE_FORMS = 12  # six patterns in units of the light of the disc, and six in units of the scene around it
+EDGE_LIKELY = 0.1  # the likely size of the latter, in units of LIKELY
+AROUND = (1.3, 2.5)  # the ring around a disc, in radii of its dark pixels
 OUTSIDE_BOXES = 8  # how far light beside the field extends
 SIDES = 3  # bumps on each side of the field
 IN_TIME = WIDTHS[-1]  # width in time of the bumps of fields that also change with place, or with the radius
@@ -173,7 +177,7 @@ class FieldColumns:
     def _computed(self, operator: str, width: float | None) -> Responses:
         ones, pointings = np.ones(len(self._infos)), np.unique(self._blocks.pointing).tolist()
         if operator == "edge":
-            return Responses(self._patterns_of_discs(), self._nothing(6), ones)
+            return Responses(self._patterns_of_discs(), self._nothing(EDGE_FORMS), ones)
         in_discs = self._in_discs(operator, width)
         if operator == "outside":
             return Responses(in_discs, self._nothing(in_discs.shape[2]), ones)
@@ -332,11 +336,20 @@ class FieldColumns:
         return np.asarray(planes[:, y[:, None], x].reshape(len(planes), -1).T)
 
     def _patterns_of_discs(self) -> Planes:
-        out = np.zeros((len(self._discs), self._cells, 6))
+        out = np.zeros((len(self._discs), self._cells, EDGE_FORMS))
         for k, disc in enumerate(self._discs):
-            own = np.vstack([np.ones(disc.residual.size), disc.patterns])
-            out[k, : disc.residual.size] = disc.mean_expected * own.T
+            own = np.vstack([np.ones(disc.residual.size), disc.patterns]).T
+            levels = disc.mean_expected, EDGE_LIKELY * self._around(disc)
+            out[k, : disc.residual.size] = np.hstack([level * own for level in levels])
         return out
+
+    def _around(self, disc: DiscCells) -> float:
+        """The mean scene in a ring around a disc, DN/s."""
+        info, edge = self._infos[disc.index], self._evidence.box_px
+        y, x = ((np.arange(one.size) + 0.5) * edge - 0.5 for one in self.at)
+        r = np.hypot(y[:, None] - info.y_px, x - info.x_px) / np.sqrt(disc.pixels.sum() / np.pi)
+        ring = (r > AROUND[0]) & (r < AROUND[1])
+        return float(disc.scene[ring].mean()) if ring.any() else 0.0
 
     # --- the PSF -------------------------------------------------------------------------------------------
 

@@ -99,22 +99,6 @@ class Field:
             return False
         return self.modulation in ("time", "place_time", "kind") or self.operator == "offset"
 
-    @property
-    def effect(self) -> str | None:
-        """The effect of the library that has this form by definition: a smooth error of the sensitivity is a flat-field residual,
-        and scatter in proportion to the place is field-dependent scatter."""
-        if (
-            self.family == "gain_place" and self.width in WIDTHS[1:]
-        ):  # smaller bumps can change every disc by its own amount
-            return "flat_field_residual"
-        if self.operator == "light" and self.modulation == "place" and self.width == WIDTHS[-1]:
-            return "intensity_gradient"
-        return (
-            "field_dependent_scatter"
-            if (self.operator, self.modulation) == ("tilted_kernel", "constant")
-            else None
-        )
-
 
 def fields_of(pointings: Sequence[int], *, exposures: bool, kinds: bool) -> list[Field]:
     """The fields that images can show. pointings: the numbers of the pointings. exposures: whether exposure times differ. kinds:
