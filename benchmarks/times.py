@@ -2,8 +2,8 @@
 
     python -m benchmarks.times [NAME ...]
 
-NAME: of `TIMES`; default: all. Each time is the shortest of several runs. Calls within a process run once before, so that
-the kernels are compiled.
+NAME: of `TIMES`; default: all. Each time is the shortest of several runs. Calls within a process run once before, so
+that the kernels are compiled.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ import numpy as np
 
 from benchmarks.figures import tell
 from benchmarks.timing import THREADS, answer_of, measured_process, peak_gib, reference, seconds
-from psfcore.blind.case_set import SetPlan, make_set
+from psfcore.blind.case_set import make_set
+from psfcore.blind.cases import SetPlan
 from psfcore.build import build_psf
 from psfcore.deconvolve.conditions import Conditions, PreparedPsfs
 from psfcore.deconvolve.methods.registry import method_named
@@ -65,7 +66,7 @@ def processor_s(code: str, compiled: str) -> float:
 
 
 def start(folder: Path, f_s: float) -> None:
-    """Processor times of imports and of the start of the command, in turn. The first run compiles the modules, and is not counted."""
+    """Processor times of imports and of the start of the command, in turn. The first run compiles and is not counted."""
     compiled = str(folder / "compiled")
     runs = [{what: processor_s(code, compiled) for what, code in CODE.items()} for _ in range(STARTS + 1)]
     for what in CODE:
@@ -130,7 +131,7 @@ def steps(folder: Path, f_s: float) -> None:
 
 
 def quick(folder: Path, f_s: float) -> None:
-    """A preview, a mesh and a design study, as ratios to 1 F. Each goal is about twice the ratio measured when it was set."""
+    """A preview, a mesh and a design study, as ratios to 1 F. Each goal was set to about twice the ratio measured."""
     hri = load_instrument("hri_euv")
     plane = np.random.default_rng(0).random((SIZE_PX, SIZE_PX)) * 1000
     pitches_um = [300.0 + 300 * step for step in range(8)]
@@ -151,7 +152,7 @@ def quick(folder: Path, f_s: float) -> None:
 
 
 def fit(_: Path, f_s: float) -> None:
-    """A fit of 126 images of 2048 px, in a process of its own. The images (4 GB) stay in the temporary folder for the next run."""
+    """A fit of 126 images of 2048 px, in a process of its own. The images (4 GB) stay there for the next run."""
     kept = Path(gettempdir()) / "heliopsf-bench-126x2048"
     if not (kept / "transit.json").is_file():
         plan = default_plan(126, SIZE_PX)
@@ -172,7 +173,7 @@ def one_fit(folder: Path) -> dict[str, Any]:
 
 
 def gap(folder: Path, f_s: float) -> None:
-    """`heliopsf gap --local` of a transit whose effect, a ghost, leaves about ten percent, so that the diagnosis has to refit."""
+    """`heliopsf gap --local` of a transit whose effect, a ghost, leaves about ten percent."""
     case, failed = make_set(folder / "set", DIAGNOSED)
     if failed:
         raise SystemExit(f"gap: the case could not be made: {failed}")

@@ -2,19 +2,21 @@
 
     python -m studies.planted [--only NAME ...] [--check] [--limit-s 600] [-o RESULT.json] [--compare RESULT.json]
 
-A fault is a mistake that a reviewer would fear: a wrong sign, a lost condition, a unit, a limit that is off by one. It is a
-patch of one or two lines. The study copies the checkout to a temporary folder, and changes only the copy. For each fault it
-applies the patch there and runs the tests of the folder of its file, and then, if these find nothing, of its whole room, until
-one fails. Slow tests are not run. It prints the state, the name, the first test that fails, and the seconds.
+A fault is a mistake that a reviewer would fear: a wrong sign, a lost condition, a unit, a limit that is off by one. It
+is a patch of one or two lines. The study copies the checkout to a temporary folder, and changes only the copy. For each
+fault it applies the patch there and runs the tests of the folder of its file, and then, if these find nothing, of its
+whole room, until one fails. Slow tests are not run. It prints the state, the name, the first test that fails, and the
+seconds.
 
-The states: found: a test fails. not found: all tests pass. no answer: the tests took longer than the limit. error: the patch
-does not apply exactly once, no test ran, or the tests could not be collected. The exit status is 1 if a fault has the state error.
+The states: found: a test fails. not found: all tests pass. no answer: the tests took longer than the limit. error: the
+patch does not apply exactly once, no test ran, or the tests could not be collected. The exit status is 1 if a fault has
+the state error.
 
---check runs no tests: it verifies that every patch applies exactly once. --compare names the faults that were found in an earlier
-result and are not found now; the exit status is then 1.
+--check runs no tests: it verifies that every patch applies exactly once. --compare names the faults that were found in
+an earlier result and are not found now; the exit status is then 1.
 
-The faults were chosen without regard to what the tests cover. Those that no test finds stay in the table. No fault is in a
-file that defines kernels (`psfcore.compiled`), because all kernels would be compiled again.
+The faults were chosen without regard to what the tests cover. Those that no test finds stay in the table. No fault is
+in a file that defines kernels (`psfcore.compiled`), because all kernels would be compiled again.
 """
 
 from __future__ import annotations
@@ -95,7 +97,8 @@ FAULTS = (
     Fault("scatter-interpolated-covariance-not-squared", "psfcore/scatter/interpolation.py",
           '(1 - weight) ** 2 * c0 + weight**2 * c1 + course', '(1 - weight) * c0 + weight * c1 + course'),
     Fault("transit-occulter-half-a-pixel-off", "psfcore/transit/occulter.py",
-          'np.arange(columns.start, columns.stop + 1) - 0.5 - place.x_px', 'np.arange(columns.start, columns.stop + 1) - place.x_px'),
+          'np.arange(columns.start, columns.stop + 1) - 0.5 - place.x_px',
+          'np.arange(columns.start, columns.stop + 1) - place.x_px'),
     Fault("transit-member-climbs-later", "psfcore/transit/admission.py",
           'or ".." in parts\n', 'or ".." in parts[:1]\n'),
     Fault("transit-guard-one-image-short", "psfcore/transit/transit.py",
@@ -103,19 +106,21 @@ FAULTS = (
     Fault("simulate-photons-counted-in-dn", "psfcore/noise.py",
           'rng.poisson(exposure_dn / self.photon_gain_dn) * self.photon_gain_dn', 'rng.poisson(exposure_dn)'),
     Fault("flare-error-of-mean-not-of-count", "psfcore/flare/arm_profile.py",
-          'np.sqrt(np.bincount(member, variance[rows, columns])) / count', 'np.sqrt(np.bincount(member, variance[rows, columns]) / count)'),
+          'np.sqrt(np.bincount(member, variance[rows, columns])) / count',
+          'np.sqrt(np.bincount(member, variance[rows, columns]) / count)'),
     Fault("gap-sign-of-nonlinearity", "psfcore/gap/library/detector.py",
           'np.asarray(-images[n] * np.exp(', 'np.asarray(images[n] * np.exp('),
     Fault("gap-closure-keeps-noise", "psfcore/gap/verdict/closure.py",
           'value = 1 - float((chi2_after - nu).sum()) / total', 'value = 1 - float(chi2_after.sum()) / total'),
-    Fault("gap-prior-of-each-pair-undivided", "psfcore/gap/verdict/posterior.py",
-          'math.log(PRIOR[kind] / max(count.get(kind, 1), 1))', 'math.log(PRIOR[kind])'),
+    Fault("gap-prior-of-each-form-undivided", "psfcore/gap/verdict/answer.py",
+          'else 0.5) / len(alike) / len(families)', 'else 0.5) / len(families)'),
     Fault("blind-half-of-a-pair-counts", "psfcore/blind/judged.py",
-          'return self.required <= set(hypothesis) and', 'return bool(self.required & set(hypothesis)) and'),
+          'if all(self.matches(one, level)', 'if any(self.matches(one, level)'),
     Fault("built-damaged-psf-used", "psfcore/psf_cache.py",
           'if sha256_of(path) == sha256:', 'if path.is_file():'),
     Fault("catalogue-claim-without-compare", "workers/catalogue/jobs.py",
-          'update(JobRow).where(JobRow.id == job_id, JobRow.phase == Phase.QUEUED)', 'update(JobRow).where(JobRow.id == job_id)'),
+          'update(JobRow).where(JobRow.id == job_id, JobRow.phase == Phase.QUEUED)',
+          'update(JobRow).where(JobRow.id == job_id)'),
     Fault("run-heart-stops-after-one-database-error", "workers/run/attempt.py",
           'could not write the heartbeat: %s", self.lease.job_id, error)\n                continue',
           'could not write the heartbeat: %s", self.lease.job_id, error)\n                return'),
@@ -164,7 +169,7 @@ def copy_checkout(copy: Path) -> None:
 
 
 def run_tests(copy: Path, tests: str, limit_s: float) -> tuple[str, str]:
-    """Run tests in the copy until one fails; returns the state, and the first test that fails or the reason of an error."""
+    """Run tests in the copy until one fails. Returns the state, and the first failing test or the reason of an error."""
     environment = os.environ | {
         "PYTHONPATH": str(copy)
     }  # Python imports the copy before the installed checkout
@@ -173,7 +178,9 @@ def run_tests(copy: Path, tests: str, limit_s: float) -> tuple[str, str]:
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-m", "not slow", tests]
     with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as output:
         streams = {"stdout": output, "stderr": subprocess.STDOUT}
-        process = subprocess.Popen(command, cwd=copy, env=environment, start_new_session=True, **streams)  # type: ignore[call-overload]
+        process = subprocess.Popen(  # type: ignore[call-overload]
+            command, cwd=copy, env=environment, start_new_session=True, **streams
+        )
         status: int | None = None
         with suppress(subprocess.TimeoutExpired):
             try:

@@ -5,7 +5,7 @@
 
 The record contains the OpenAPI document, the HTTP status of every error code, the help of every command, the page of
 the settings, and small results that are made in this process: the bytes of a PSF and of a product, their ids, a report
-on a transit, and a gap report of schema gap/2. Values that differ between two runs of one version (job ids) or between
+on a transit, and a gap report of schema gap/3. Values that differ between two runs of one version (job ids) or between
 two machines (versions of libraries) are left out. --compare prints every difference, and exits with status 1 if there
 is one. Results of two machines can differ in the last digits, so compare records of one machine.
 """

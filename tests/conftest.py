@@ -126,7 +126,7 @@ def _own_cache(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Put the longest files first; refuse tests of one id: of these, side by side, one alone is run and nobody sees it."""
+    """Put the longest files first; refuse tests of one id: of these only one is run, and nobody sees it."""
     twice = [name for name, count in Counter(item.nodeid for item in items).items() if count > 1]
     if twice:
         raise pytest.UsageError(

@@ -1,4 +1,4 @@
-"""A small transit that a local service fitted and cross-validated once in a run; tests open copies of its data folder."""
+"""A small transit that a local service fitted and cross-validated once in a run; tests open copies of its data."""
 
 from __future__ import annotations
 

@@ -21,6 +21,7 @@ from psfcore.fits.blocks import FitsLimits
 from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.closed_form import ClosedForm
 from psfcore.gap.evidence.expected_gap import linear_model_of
+from psfcore.gap.evidence.tree import SUN
 from psfcore.gap.library.registry import LIBRARY
 from psfcore.gap.verdict.answer import FLOOR
 from psfcore.gap.verdict.limits import Limits, limits
@@ -132,10 +133,11 @@ def planned_limits(
     start = SOFTENED_POWER_LAW.coordinates({"b_px": SCATTER.b_px, "c": SCATTER.c, "total": SCATTER.total})
     solution = invert(transit, start=start, near=True, threads=threads, progress=progress)
     model, _ = linear_model_of(View(solution), library, seed=seed, progress=progress)
-    effects = model.evidence.effects
+    effects, found = model.evidence.effects, limits(ClosedForm(model), observed=False)
+    untestable = {**found.untestable, SUN: "a plan has no images of the Sun"}
     return Planned(
         plan,
-        limits(ClosedForm(model), observed=False),
+        replace(found, untestable=untestable),
         tuple(effect.name for effect in effects if effect.held is not None),
         {effect.name: effect.settled_by for effect in effects},
         dict(solution.inversion.left_out),

@@ -4,11 +4,8 @@ The gain of an effect is the decrease of chi2 when its parameters are fitted tog
 free parameter gains a chi2 variable with one degree of freedom, and the parameters of a random field gain less
 (`linear_model`, Eq. (3)). If an effect searched among many templates, its p-value is multiplied by their number.
 
-The p-value of the gap is the probability of residuals at least as large as these if there is no gap. The fit of the PSF alone
-is tested with four values of chi2: of the patterns that a gap of any cause produces, of the means of the
-discs, of all cells, and of the blocks of the unocculted field. The result is the smallest p-value of these tests, times the
-number of tests. A gap of unknown cause is usually smooth in time within a pointing, and varies within a disc with radius or
-azimuth. The test with these few patterns detects such a gap more easily than chi2 of all cells, because most of that chi2 is noise.
+The p-value of the gap is the probability of residuals at least as large as these if there is no gap: the smallest p-value of chi2 of
+all cells, of the means of the discs, and of the blocks of the unocculted field, after the fit of the PSF alone, times three.
 """
 
 from __future__ import annotations
@@ -22,7 +19,6 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from psfcore.gap.effect import Effect
-from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.linear_model import LinearModel, Step
 
 Vector = NDArray[np.float64]
@@ -30,7 +26,6 @@ Matrix = NDArray[np.float64]
 
 # Chi2 of the unocculted field may exceed its degrees of freedom by this fraction without a gap: the Sun always changes a little.
 UNOCCULTED_WIDTH = 0.03
-DEGREES = 4  # number of polynomials in time of the patterns: degrees 0 to 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,39 +113,19 @@ def _p_value(model: LinearModel, columns: Sequence[int], gain: float, trials: fl
 def p_value_of_gap(model: LinearModel) -> float:
     """The p-value of the gap of a linear model."""
     cells, blocks = left_chi2(model, model.base)
-    left = model.left(model.base)
+    freedom = max(sum(disc.residual.size for disc in model.discs) - len(model.base.columns), 1)
+    # Chi2 of the means of the discs: one value for each disc.
+    light = [
+        white.white @ disc.expected for disc, white in zip(model.evidence.discs, model.discs, strict=True)
+    ]
+    means = [
+        float(one @ left) ** 2 / max(float(one @ one), 1e-300)
+        for one, left in zip(light, model.left(model.base), strict=True)
+    ]
+    of_means = max(len(means) - len(model.base.columns), 1), sum(means)
     tests = (
-        model.gain_of_patterns(model.base, _patterns(model.evidence), left),
-        model.gain_of_patterns(model.base, means(model.evidence), left),
-        (cells, max(sum(one.size for one in left) - len(model.base.columns), 1)),
-        (max(blocks / (1 + UNOCCULTED_WIDTH), 0.0), max(model.evidence.steady_unocculted.freedom, 1)),
+        (freedom, cells),
+        of_means,
+        (model.evidence.all_unocculted.independent, blocks / (1 + UNOCCULTED_WIDTH)),
     )
-    return min(1.0, len(tests) * min(float(chdtrc(freedom, chi2)) for chi2, freedom in tests))
-
-
-def _patterns(evidence: Evidence) -> list[Matrix]:
-    """For each disc, the patterns that a gap of any cause produces (patterns, cells), DN/s: polynomials in time for each
-    pointing, and `DiscCells.patterns`, scaled by the mean expected light of the disc."""
-    pointings = sorted({taken.pointing for taken in evidence.image_info})
-    out = []
-    for disc in evidence.discs:
-        taken = evidence.image_info[disc.index]
-        times = [other.time_s for other in evidence.image_info if other.pointing == taken.pointing]
-        first, last = min(times), max(times)
-        at = 2 * (taken.time_s - first) / (last - first) - 1 if last > first else 0.0
-        in_time = np.zeros((len(pointings), DEGREES))
-        in_time[pointings.index(taken.pointing)] = [
-            np.polynomial.Legendre.basis(k)(at) for k in range(DEGREES)
-        ]
-        level = np.full(disc.expected.size, disc.mean_expected)
-        out.append(np.vstack([in_time.ravel()[:, None] * level, disc.patterns * level]))
-    return out
-
-
-def means(evidence: Evidence) -> list[Matrix]:
-    """Patterns that change the mean of one disc only: for each disc an array (discs, cells), DN/s.
-
-    Row k is zero in all discs but disc k. There it is the expected light.
-    """
-    own = np.eye(len(evidence.discs))
-    return [np.outer(row, disc.expected) for row, disc in zip(own, evidence.discs, strict=True)]
+    return min(1.0, len(tests) * min(float(chdtrc(count, max(chi2, 0.0))) for count, chi2 in tests))

@@ -132,14 +132,6 @@ class Evidence:
         """The normal equations of all columns from the unocculted blocks of all images."""
         return self.unocculted.equations(range(self.size))
 
-    @cached_property
-    def steady_unocculted(self) -> UnoccultedEquations:
-        """As `all_unocculted`, but the weight of a flickering block follows from its observed variance, so it is low.
-
-        These equations are used to judge residuals.
-        """
-        return self.unocculted.with_flickering_blocks().equations(range(self.size))
-
     @property
     def size(self) -> int:
         """The number of columns."""

@@ -179,40 +179,8 @@ class LinearModel:
         return tuple(d.residual - d.jacobian[list(step.columns)].T @ step.values for d in self.discs)
 
     def left_unocculted(self, step: Step) -> float:
-        """The chi2 of the unocculted blocks after a fit, divided by unocculted_scale. Flickering blocks have a low weight."""
-        here, unocculted = list(step.columns), self.evidence.steady_unocculted
+        """The chi2 of the unocculted blocks after a fit, divided by unocculted_scale."""
+        here, unocculted = list(step.columns), self.evidence.all_unocculted
         theta = step.values
         fall = 2 * theta @ unocculted.score[here] - theta @ unocculted.normal[np.ix_(here, here)] @ theta
         return float(unocculted.chi2 - fall) / self.unocculted_scale
-
-    def gain_of_patterns(
-        self, step: Step, patterns: Sequence[Matrix], left: Sequence[Vector]
-    ) -> tuple[float, int]:
-        """The decrease of the chi2 of the discs by patterns that are added to a fit, and the number of independent patterns.
-
-        patterns: for each disc (patterns, cells), DN/s. left: whitened residuals of each disc after the fit. The columns of the
-        fit are refitted together with the patterns.
-        """
-        here = list(step.columns)
-        design = np.concatenate(
-            [
-                np.vstack([disc.jacobian[here], pattern @ disc.white])
-                for disc, pattern in zip(self.discs, patterns, strict=True)
-            ],
-            axis=1,
-        )
-        residual = np.concatenate(left)
-        first = len(here)
-        basis = _orthonormal(design[:first])
-        rest = design[first:] - (design[first:] @ basis.T) @ basis
-        size = np.linalg.norm(design[first:], axis=1)
-        rest = _orthonormal(rest / np.maximum(size, 1e-300)[:, None], 1e-4)
-        return float(np.sum((rest @ residual) ** 2)), rest.shape[0]
-
-
-def _orthonormal(rows: Matrix, least: float = 1e-7) -> Matrix:
-    """An orthonormal basis of the row space."""
-    if rows.shape[0] == 0:
-        return rows
-    _, sizes, basis = np.linalg.svd(rows, full_matrices=False)
-    return np.asarray(basis[sizes > least * max(float(sizes[0]), 1e-300)])

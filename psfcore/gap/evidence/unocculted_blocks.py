@@ -10,15 +10,12 @@ the Sun and the shutter vary by about one percent. e_nb is the change of the blo
 
 g_n has a Gaussian prior. The width of the prior is the spread of g_n among images of the same pointing, gain mode and
 exposure; a difference between gain modes can then be separated from g_n.
-
-If a bright block varies between images far more than the other blocks do, the Sun has changed there, for example by a
-flickering brightening. When residuals are judged, the variance of such a block is raised to the observed variance.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -39,7 +36,6 @@ WIDEST_GAIN = 0.05  # width of the prior of g_n if the images do not show its sp
 LEAST_GAIN = 1e-5  # smallest width of the prior of g_n
 FLOOR = 5e-4  # relative error of the level of a block, because no template is more exact
 LEAST_IMAGES = 3
-FLICKERING = 4.0  # a block flickers if its chi2 per degree of freedom exceeds this multiple of the median
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,31 +60,6 @@ class UnoccultedBlocks:
     part: NDArray[np.bool_]
     across: int
     given_gain_width: float | None = None
-
-    def with_flickering_blocks(self) -> UnoccultedBlocks:
-        """The same blocks, with the variance of flickering blocks raised to their observed variance."""
-        return replace(self, variance=self.variance * self.flicker)
-
-    @cached_property
-    def flicker(self) -> Matrix:
-        """The observed variance of each flickering block, divided by the usual variance; 1 for the other blocks: (images, blocks)."""
-        excess = np.ones_like(self.variance)
-        steady = self.levels / (1 + self._gains[:, None])
-        weights = self._weights
-        for pointing in np.unique(self.pointing):
-            here = np.flatnonzero((self.pointing == pointing) & self.part)
-            weight = weights[here]
-            images = (weight > 0).sum(axis=0)
-            used = images >= LEAST_IMAGES
-            if not used.any():
-                continue
-            mean = (steady[here] * weight).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-300)
-            spread = (weight * (steady[here] - mean) ** 2).sum(axis=0) / np.maximum(images - 1, 1)
-            usual = max(float(np.median(spread[used])), 1.0)
-            # The variance of faint blocks is not changed: they show how the detector changes faint signals.
-            bright = used & (mean > float(np.median(mean[used])))
-            excess[here] = np.where(bright & (spread > FLICKERING * usual), spread / usual, 1.0)
-        return excess
 
     @cached_property
     def gain_width(self) -> float:
@@ -155,6 +126,7 @@ class UnoccultedBlocks:
             score=score[:size] - cross @ gains,
             chi2=chi2 - float(score[size:] @ gains),
             freedom=max(freedom - chosen.size, 1),
+            independent=max(freedom - float(np.sum(normal[size:, size:] * inverse)), 1.0),
             gains=gains,
         )
 
@@ -200,13 +172,15 @@ class UnoccultedEquations:
     """Normal equations of some columns, with brightness and scene eliminated.
 
     normal: the normal matrix. score: the right-hand side. chi2: after the fit of scene and brightness alone, without the columns.
-    freedom: degrees of freedom of this chi2. gains: the fitted g_n of each image, without the columns.
+    freedom: degrees of freedom of this chi2, if the brightness of every image is free. independent: the same with the prior of the brightness, which leaves
+    it less free. gains: the fitted g_n of each image, without the columns.
     """
 
     normal: Matrix
     score: Vector
     chi2: float
     freedom: int
+    independent: float
     gains: Vector
 
 

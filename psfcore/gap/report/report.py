@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
+from psfcore.drawing.page import with_error
 from psfcore.gap.diagnose import Diagnosis, Shrinking
 from psfcore.gap.evidence.columns import FieldShape, another
 from psfcore.gap.evidence.effect_fits import EffectFit, left_chi2
@@ -26,6 +27,7 @@ MOST_READ = 12  # if an effect has more parameters, the report summarises them
 LEAST_SHARE = 1e-3  # hypotheses and labels with a smaller probability are not listed
 LEAST_SHARE_OF_AXIS = 0.1  # an axis with a smaller share is not part of the first line
 MOST_AXES, MOST_LIMITS = 3, 3
+CLEAR = 2.0  # errors: the place of a field is told if its value there is larger
 VISIBLE_P = 0.005  # the discs show a gap if its p-value is below this
 AXIS_WORDS = {
     "detector_x": "along detector x",
@@ -307,7 +309,7 @@ def _where(found: Diagnosis) -> str:
     told = ", ".join(f"{AXIS_WORDS[axis.name]} ({100 * axis.share:.0f} %)" for axis in axes)
     place = next((_place(found.shapes[f]) for f in _told_families(found) if f in found.shapes), "")
     varies = f"; it varies {told}" if told else "" if place else "; it varies along no single axis"
-    numbers = found.where[0].at.get("pointings", []) if found.where else []
+    numbers = axes[0].at.get("pointings", []) if axes else []
     largest = (
         f", and is largest in pointing{'s' if len(numbers) > 1 else ''} {' and '.join(map(str, numbers))}"
     )
@@ -319,8 +321,8 @@ def _told_families(found: Diagnosis) -> list[str]:
 
 
 def _place(shape: FieldShape) -> str:
-    """Where a field is clearest, as the end of a sentence; empty if it has no shape."""
-    if not shape.axes:
+    """Where a field is clearest, as the end of a sentence; empty if it has no shape, or if it is clear nowhere."""
+    if not shape.axes or abs(shape.values[shape.clearest]) < CLEAR * shape.sigma[shape.clearest]:
         return ""
     only = " (known only near the discs)" if "x_px" in shape.axes else ""
     return f"; the change is clearest with {clearest_words(shape)}{only}"
@@ -336,7 +338,9 @@ def clearest_words(shape: FieldShape) -> str:
         "radius_px": "{:.0f} px from the centre of the PSF",
     }
     place = ", ".join(names[axis].format(at) for axis, at in zip(shape.axes, shape.at[k], strict=True))
-    return f"{shape.values[k]:.2g} ± {shape.sigma[k]:.1g} {shape.unit}".rstrip() + f" at {place}"
+    return (
+        f"{with_error(float(shape.values[k]), float(shape.sigma[k]))} {shape.unit}".rstrip() + f" at {place}"
+    )
 
 
 def _which(found: Diagnosis) -> str:
@@ -376,8 +380,10 @@ def _how_far(found: Diagnosis) -> str:
     if told is None or shrinking is None:
         return "a changing Sun has no form that could be taken out of the images; the fit of the PSF is not changed."
     closure = shrinking.closure
-    if found.residual is None or closure is None:
-        return "these data cannot say: no image can be held out, or the held-out images show no gap."
+    if found.residual is None:
+        return "these data cannot say: no image can be held out."
+    if closure is None:
+        return "these data cannot say: too few images are left to fit the causes, or the held-out images show no gap."
     out = f"in the model, {cause_names(told)} closes {_closure_words(closure)} of the gap on held-out images"
     others = [
         f"{words(name)} closes {_closure_words(other)}"
@@ -394,7 +400,8 @@ def _how_far(found: Diagnosis) -> str:
 
 
 def _closure_words(closure: Interval) -> str:
-    return f"{100 * closure.value:.0f} % ({100 * closure.low:.0f} to {100 * closure.high:.0f})"
+    value, low, high = (round(100 * one) + 0 for one in (closure.value, closure.low, closure.high))
+    return f"{max(value, 0)} % ({'less than 0' if low < 0 else low} to {max(high, 0)})"
 
 
 def cause_names(told: EffectFit) -> str:
@@ -438,7 +445,7 @@ def shown_by_blocks(found: Diagnosis) -> bool:
         return False
     cells, blocks = left_chi2(model, model.base)
     freedom = sum(disc.residual.size for disc in model.discs)
-    free_blocks = model.evidence.steady_unocculted.freedom
+    free_blocks = model.evidence.all_unocculted.independent
     return bool(chdtrc(freedom, cells) > VISIBLE_P > chdtrc(free_blocks, max(blocks, 0.0)))
 
 

@@ -184,7 +184,7 @@ def answer_of(model: LinearModel, level: float) -> Answer:
     none = shares.get((), 0.0)
     by_label = _sum((frozenset(map(label_of, forms)), share) for forms, share in shares.items())
     causes = causes_of(by_label, level)
-    verdict, named = _verdict(causes, len(model.evidence.discs))
+    verdict, named = verdict_of(causes, len(model.evidence.discs))
     acting = max((forms for forms in shares if forms), key=lambda forms: shares[forms])
     return Answer(
         causes,
@@ -343,7 +343,7 @@ def _sorted(shares: Mapping[Key, float]) -> dict[Key, float]:
 def _of_labels(shares: Mapping[Labels, float]) -> dict[Label, float]:
     out: dict[Label, float] = defaultdict(float)
     for labels, share in shares.items():
-        for label in labels:
+        for label in sorted(labels, key=str):  # equally probable labels have the same order in every process
             out[label] += share
     return dict(out)
 
@@ -407,7 +407,7 @@ def _alternative(label: Label, share: float) -> Alternative:
     return Alternative(FAMILIES[family], effect, min(share, 1.0))
 
 
-def _verdict(causes: Collection[Cause], images: int) -> tuple[Verdict, tuple[str, ...]]:
+def verdict_of(causes: Collection[Cause], images: int) -> tuple[Verdict, tuple[str, ...]]:
     """The verdict, and the effects that it names."""
     if not causes:
         return ("none" if images >= LEAST_IMAGES else "inconclusive"), ()

@@ -40,7 +40,7 @@ Matrix = NDArray[np.float64]
 
 FOUND, EXCLUDED = 0.9, 0.95
 ALIKE = 3.0  # in sigma: a difference of chi2 of 9
-DRAWS, SEED = 200, 1
+DRAWS, SEED = 500, 1
 # Strengths between these multiples of the error of the parameter are tried.
 WEAKEST_TRIED, STRONGEST_TRIED, TRIED = 0.5, 3000.0, 48
 CREDIBLE = 1000.0  # a strength above this multiple of the likely size is not stated

@@ -6,15 +6,25 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from psfcore.gap.effect import Effect
+from psfcore.gap.evidence import closed_form
 from psfcore.gap.evidence.cells import DiscCells
 from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
-from psfcore.gap.evidence.tree import SUN
+from psfcore.gap.evidence.tree import SUN, Field
 from psfcore.gap.library.registry import LIBRARY
 
 FEW = tuple(effect for effect in LIBRARY if effect.name in ("dark_offset", "column_smear"))
+
+
+LIGHT = Field("light_place", "light", "place", 0.8)
+
+
+def use_fields(patched: pytest.MonkeyPatch, *fields: Field) -> None:
+    """Weigh the effects beside these fields alone, which is quicker; by default beside one."""
+    patched.setattr(closed_form, "fields_of", lambda pointings, **how: list(fields or [LIGHT]))
 
 
 def with_sun(evidence: Evidence) -> Evidence:
@@ -64,7 +74,7 @@ def sigma_of(evidence: Evidence, name: str) -> float:
 
 
 def dense(model: LinearModel) -> tuple[np.ndarray, np.ndarray]:
-    """The Jacobian (cells, columns) and the residuals (cells,) of all discs in units of their noise, computed without the model."""
+    """The Jacobian (cells, columns) and the residuals (cells,) of all discs, in units of the noise."""
     jacobians, residuals = [], []
     for disc in model.evidence.discs:
         covariance = disc.covariance + model.floor**2 * np.outer(disc.expected, disc.expected)
@@ -75,7 +85,10 @@ def dense(model: LinearModel) -> tuple[np.ndarray, np.ndarray]:
 
 
 def drawn(model: LinearModel, values: dict[tuple[str, int], float], seed: int) -> LinearModel:
-    """The model with data drawn from it: noise, and the change by these parameters. values: by effect and number of the parameter."""
+    """The model with data drawn from it: noise, and the change by these parameters.
+
+    values: by effect and number of the parameter.
+    """
     evidence, rng = model.evidence, np.random.default_rng(seed)
     theta = np.zeros(evidence.size)
     for (name, k), value in values.items():

@@ -39,7 +39,7 @@ def few_sign_flips() -> AbstractContextManager[object]:
 
 @contextmanager
 def small_reach() -> Iterator[None]:
-    """Make corrected PSFs of REACH_PX px: those of 2048 px take 200 MB. A fit to a field of up to 256 px is the same."""
+    """Make corrected PSFs of REACH_PX px: those of 2048 px take 200 MB. Fits of up to 256 px stay the same."""
     with (
         patch.object(corrected_psf, "REACH_GRID_PX", REACH_PX),
         patch.object(total_psf, "REACH_GRID_PX", REACH_PX),

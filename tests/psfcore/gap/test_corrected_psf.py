@@ -1,4 +1,4 @@
-"""The corrected PSF: its kernel contains effects of the optics but not of the detector, and its file records its origin."""
+"""The corrected PSF: its kernel contains effects of the optics but not of the detector, and its file its origin."""
 
 from __future__ import annotations
 
@@ -97,11 +97,11 @@ def test_its_file_records_its_origin_and_the_gap_before_and_after(tmp_path: Path
     shape, start = start_of(back)
     assert shape is SHAPES["softened-power-law"]
     assert start == pytest.approx(added.solution.inversion.coordinates)
-    said = psf.provenance
-    assert (said["gap_before_pct"], said["gap_after_pct"]) == (found().rms.to_json(), found().after.to_json())
+    told = psf.provenance
+    assert (told["gap_before_pct"], told["gap_after_pct"]) == (found().rms.to_json(), found().after.to_json())
     value, sigma, unit = added.values["offset"]
-    assert said["effect_parameters"] == {"offset": {"value": value, "sigma": sigma, "unit": unit}}
-    assert said["inputs_sha256"]["000.fits"] == "ab" * 32
+    assert told["effect_parameters"] == {"offset": {"value": value, "sigma": sigma, "unit": unit}}
+    assert told["inputs_sha256"]["000.fits"] == "ab" * 32
     # Its errors include those of the effect.
     assert psf.fitted is not None
     covariance, alone = np.array(psf.fitted.covariance), added.model.base.covariance

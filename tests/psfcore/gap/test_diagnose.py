@@ -1,6 +1,6 @@
 """The diagnosis of small simulated transits: clean data show no gap, and a simulated effect is found.
 
-The diagnosis of clean images uses the whole library; the others use fewer effects. `test_known_effects.py` has the slow ones.
+The diagnosis of clean images uses the whole library; others use fewer effects. `test_known_effects.py` has slow ones.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from psfcore.gap.report.report import gap_report
 from psfcore.gap.verdict import where
 from psfcore.gap.verdict.calibration import Calibration
 from psfcore.gap.verdict.limits import limits
-from psfcore.gap.verdict.posterior import NONE, UNKNOWN, Form
 from psfcore.noise import Noise
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.transit import simulate
@@ -45,18 +44,17 @@ def clean() -> Transit:
 
 
 def check_no_gap(found: Diagnosis) -> None:
-    """No gap is the most probable hypothesis, and no effect is named."""
-    assert found.judgement.members[0] == NONE and found.judgement.answer == ()
-    assert found.p_value > 1e-3
+    """No cause is the most probable hypothesis, and none is told."""
+    assert next(iter(found.answer.hypotheses)) == frozenset() and found.answer.causes == ()
+    assert found.told is None and found.corrected is None and found.p_value > 1e-3
 
 
 def test_clean_images_have_no_gap_and_the_report_is_json(clean: Transit) -> None:
     found = diagnose(clean, solution=small_gaps.fit(clean))
     check_no_gap(found)
-    # The set may contain more: these few small images do not exclude a weak effect.
-    assert found.judgement.verdict == "none"
+    assert found.answer.verdict == "none" and found.answer.closed.misfit[0] < 1.5
     report = json.loads(json.dumps(gap_report(found), allow_nan=False))
-    assert report["schema"] == "gap/2" and report["sentence"].startswith("No gap")
+    assert report["schema"] == "gap/3" and "no gap" in report["lines"][0]
     names = {effect["name"] for effect in report["effects"]} | {e["name"] for e in report["untestable"]}
     assert names == {effect.name for effect in LIBRARY}
     assert all(effect["closure"] is None for effect in report["effects"])
@@ -66,30 +64,34 @@ def test_clean_images_have_no_gap_and_the_report_is_json(clean: Transit) -> None
 def test_a_read_pattern_is_not_attributed_to_an_effect(clean: Transit) -> None:
     stripes = 20 * np.sin(2 * np.pi * np.arange(clean.shape[1]) / 45) * np.ones((clean.shape[0], 1))
     found = diagnose(changed(clean, lambda n, f: f.pixels + stripes / f.exposure_s), library=FEW, refit=False)
-    assert UNKNOWN in found.judgement.members
+    assert all(one.effect is None for cause in found.answer.causes for one in cause.alternatives)
+    assert found.answer.verdict == "unknown" and found.corrected is None and found.shapes
 
 
 def test_a_dark_offset_is_found_with_its_size_and_taken_out() -> None:
     full = small_gaps.found()
-    assert full.judgement.verdict == "attributed" and full.judgement.answer == ("dark_offset",)
-    (fit,) = full.corrected
+    assert full.answer.verdict == "attributed" and full.answer.named == ("dark_offset",)
+    fit = full.corrected
+    assert fit is not None and full.told is not None and full.told.names == ("dark_offset",)
     value, sigma, unit = fit.values["offset"]
     assert unit == "DN" and value == pytest.approx(small_gaps.OFFSET_DN, abs=4 * sigma) and sigma < 0.5
-    shrinking = full.shrinking[Form(("dark_offset",))]
-    assert shrinking.closure_by_pointing is not None and shrinking.closure_by_pointing.low > 0.7
+    shrinking = full.shrinking_of_told
+    assert (
+        shrinking is not None
+        and shrinking.closure_by_pointing is not None
+        and shrinking.closure_by_pointing.low > 0.7
+    )
     assert shrinking.held_out_fall is not None and shrinking.held_out_fall > 10
     assert full.after.value < min(1.0, full.rms.value / 2)
     # A wrong dark level biases the fit of the PSF; with the effect in the model the bias is gone.
     bent, straight = (s.inversion.values["total"] for s in (full.solution, fit.solution))
     assert abs(straight - TRUTH.total) < abs(bent - TRUTH.total) - 0.005
     # The limit of the offset is that of the full refit, and above the truth; the strength that would be found stays.
-    linear = limits(
-        full.model, threshold=full.calibration.threshold(0.9), temperature=full.calibration.temperature
-    )
+    linear = limits(full.answer.closed)
     (limit,), (before,) = (one.effects["dark_offset"].parameters for one in (full.limits, linear))
     assert before.found_90 == limit.found_90 and before.excluded_95 != limit.excluded_95
     assert limit.excluded_95 == pytest.approx(value + 1.645 * sigma, rel=1e-3)
-    assert small_gaps.OFFSET_DN < limit.excluded_95 < small_gaps.OFFSET_DN + 1.0
+    assert limit.excluded_95 is not None and 0 < limit.excluded_95 - small_gaps.OFFSET_DN < 1.0
     assert full.p_value < 1e-10
 
 
@@ -105,21 +107,21 @@ def test_light_lost_by_clipping_is_attributed_to_saturation_fill(clean: Transit)
         for f in clean.frames
     )
     found = diagnose(replace(clean, frames=frames), library=FEW, refit=False)
-    assert found.judgement.answer == ("saturation_fill",) and found.corrected == ()
-    fit = found.fits[Form(("saturation_fill",))]
+    assert found.answer.named == ("saturation_fill",) and found.corrected is None
+    fit = found.fits["saturation_fill"]
     # The loss is larger inside than at the rim, as simulated.
     value, sigma, _ = fit.values["excess_inside"]
     assert value < -2 * sigma
 
 
 def test_wrong_noise_figures_are_noticed_and_are_not_a_gap(clean: Transit) -> None:
-    """The set has the coverage that was asked for, by the calibration of 39 cases."""
+    """The answer has the level of the coverage that was asked for, by the calibration of 39 cases."""
     wrong = replace(clean, noise=Noise(clean.noise.photon_gain_dn * 2.0, clean.noise.read_noise_dn * 2.0))
-    calibration = Calibration(1.0, tuple(np.geomspace(1e-4, 0.9, 39)), {})
+    calibration = Calibration((0.97,) * 39, {})
     found = diagnose(wrong, library=FEW, refit=False, coverage=0.95, calibration=calibration)
     check_no_gap(found)
     assert any("times the stated variance" in caution for caution in found.cautions)
-    assert found.judgement.members == calibration.answer(found.judgement.hypotheses, 0.95)
+    assert found.answer.level == 0.97 and found.calibration is calibration
     for library, coverage, code in ((FEW, 0.98, "bad-coverage"), ((), 0.95, "bad-library")):
         with pytest.raises(DataError, match=code):
             diagnose(clean, library=library, coverage=coverage, calibration=calibration)
@@ -135,13 +137,13 @@ def test_wrong_noise_figures_are_noticed_and_are_not_a_gap(clean: Transit) -> No
 def test_cautions_tell_what_one_pointing_and_few_images_cannot_show(clean: Transit) -> None:
     one = replace(clean, frames=tuple(f for f in clean.frames if f.pointing == 2))
     found = diagnose(one, library=FEW, refit=False)
-    assert found.judgement.verdict == "inconclusive"  # four images: a gap may exist
+    assert found.answer.verdict == "inconclusive"  # four images: a gap may exist
     check_no_gap(found)
     for said in ("the same pointing", "the same exposure time"):
         assert any(said in caution for caution in found.cautions), said
     assert {"gain_mismatch", "saturation_fill"} <= {e["name"] for e in gap_report(found)["untestable"]}
     few = diagnose(replace(clean, frames=(one.frames[0], *one.frames[2:])), library=FEW, refit=False)
-    assert few.judgement.verdict == "inconclusive"
+    assert few.answer.verdict == "inconclusive"
     assert any("held out" in caution for caution in few.cautions)
     with pytest.raises(DataError, match="too-few-frames"):
         diagnose(replace(clean, frames=one.frames[:2]), library=FEW)

@@ -8,7 +8,6 @@ import pytest
 from psfcore.blind.effects.scene import patches
 from psfcore.gap.diagnose import Diagnosis, diagnose
 from psfcore.gap.report.report import gap_report
-from psfcore.gap.verdict.posterior import NONE, UNKNOWN, Form
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.transit import simulate
 from psfcore.transit.transit import Frame, Transit
@@ -31,12 +30,12 @@ def verdict(transit: Transit) -> Diagnosis:
 
 
 def fitted(found: Diagnosis, name: str) -> dict[str, tuple[float, float, str]]:
-    return found.fits[Form((name,))].values
+    return found.fits[name].values
 
 
 def test_a_gain_mismatch_shows_in_the_unocculted_field_and_hardly_in_the_discs(clean: Transit) -> None:
     found = verdict(changed(clean, lambda n, f: f.pixels * (1.08 if f.gain_mode == "combined" else 1.0)))
-    assert found.judgement.answer == ("gain_mismatch",)
+    assert found.answer.named == ("gain_mismatch",)
     value, sigma, _ = fitted(found, "gain_mismatch")["excess"]
     assert value == pytest.approx(0.08, abs=max(5 * sigma, 0.02))
     assert found.rms.value < 3.0  # percent: the discs hardly show it
@@ -55,20 +54,19 @@ def test_persistence_whatever_its_decay_time(clean: Transit) -> None:
         return np.asarray(f.pixels + 0.06 * left, dtype=np.float32)
 
     found = verdict(changed(clean, remembered))
-    assert found.judgement.answer == ("persistence",)
+    assert found.answer.named == ("persistence",)
     values = fitted(found, "persistence").values()
     assert sum(value for value, _, _ in values) == pytest.approx(0.06, rel=0.3)
-    closure = found.shrinking[Form(("persistence",))].closure
+    closure = found.shrinking["persistence"].closure
     assert closure is not None and closure.value > 0.9
 
 
 def test_a_patchy_flat_field_error(clean: Transit) -> None:
     uneven = 1 + 0.15 * patches(clean.shape[0], seed=3, patch=0.2)
-    # The linear model alone does not decide whether light from outside the field acts as well; the full refit does. The data do not
-    # exclude that a weak second cause acts beside the patches.
     found = diagnose(changed(clean, lambda n, f: f.pixels * uneven))
-    assert found.judgement.members[0] == ("flat_field_residual",) == found.judgement.certain
-    closure = found.shrinking[Form(("flat_field_residual",))].closure
+    (first, *_) = found.answer.causes
+    assert first.effects == ("flat_field_residual",)
+    closure = found.shrinking["flat_field_residual"].closure
     assert closure is not None and closure.value > 0.3
     # Parameters that the discs do not constrain stay near 0, so together they are no larger than the patches.
     values = fitted(found, "flat_field_residual")
@@ -83,24 +81,22 @@ def test_a_sun_that_changes_faster_than_the_images_follow_is_still_named() -> No
         return np.asarray(f.pixels * np.exp(0.3 * (one * np.sin(0.9 * n) + other * np.cos(0.9 * n))))
 
     found = verdict(changed(simulate(plan, TRUTH, diffraction(), seed=8).transit, flickering))
-    # The effect does not change the discs. In so strong a change of the scene, however, the places of some occulters are wrong,
+    # The effect does not change the discs. In so strong a change, however, the places of some occulters are wrong,
     # and the discs show a gap. A second effect is named for this gap.
     assert any("The fitted position of the occulter may be wrong" in caution for caution in found.cautions)
-    assert all("scene_evolution" in names for names in found.judgement.members)
-    assert next(iter(found.fits)) == Form(("scene_evolution",))
+    assert "scene_evolution" in found.answer.causes[0].effects
 
 
 def test_a_patch_of_light_is_not_attributed_to_an_effect(clean: Transit) -> None:
     ny, nx = clean.shape
     glow = 40 * np.exp(-0.5 * ((np.arange(nx) - 60) / 14) ** 2) * np.ones((ny, 1))
     found = verdict(changed(clean, lambda n, f: f.pixels + glow))
-    assert UNKNOWN in found.judgement.members
-    first = gap_report(found)["unknown"]["fields"][0]
-    assert (first["stage"], first["form"]) == ("detector", "light")
+    (cause,) = gap_report(found)["causes"]
+    assert cause["alternatives"][0]["family"] == "light_place" and cause["field"] is not None
 
 
 def test_brightness_that_varies_between_images_is_not_a_gap(clean: Transit) -> None:
     waver = 1 + 0.01 * np.random.default_rng(3).standard_normal(len(clean.frames))
     found = verdict(changed(clean, lambda n, f: f.pixels * waver[n]))
-    assert found.judgement.members[0] == NONE and found.judgement.answer == ()
+    assert next(iter(found.answer.hypotheses)) == frozenset() and found.answer.causes == ()
     assert found.p_value > 1e-3

@@ -1,4 +1,4 @@
-"""Plans: an exposure ladder tells a dark offset from scatter, the limits agree with data, and the page says what was found."""
+"""Plans: an exposure ladder tells a dark offset from scatter, the limits agree with data, and a page says it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.transit_files import diffraction
 NAMES = ("dark_offset", "intensity_gradient", "gain_mismatch", "wide_halo")
 FEW = tuple(effect for effect in LIBRARY if effect.name in NAMES)
 ONE, LADDER = (1.8,), (0.6, 1.8, 5.0)
-IMAGES, SIZE_PX = 15, 96
+IMAGES, SIZE_PX = 12, 96
 
 
 def plan_with(exposures_s: Sequence[float], images: int = IMAGES) -> Plan:

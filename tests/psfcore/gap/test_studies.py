@@ -1,46 +1,45 @@
-"""The study of the calibration: the share of the true cause, and the temperature that it fits."""
+"""The study of the calibration: the smallest level at which the answer to a case contains a true cause."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
+from typing import Any
 
-import numpy as np
 import pytest
 
-from psfcore.gap.verdict.posterior import NONE, PRIOR, UNKNOWN, Kind
-from studies.gap_calibration import Case, calibrated
+from studies.gap_calibration import MISSED, calibrated, smallest_level
 
-A, B, AB = ("a",), ("b",), ("a", "b")
-
-
-def drawn_cases(count: int, temperature: float, prior: Mapping[Kind, float] = PRIOR) -> list[Case]:
-    """Cases whose weights are too sure: the truth is drawn from their probabilities at this temperature, and with this prior."""
-    rng = np.random.default_rng(5)
-    cases = []
-    for number in range(count):
-        logs = dict(zip((NONE, UNKNOWN, A, B), (4 * rng.normal(size=4)).tolist(), strict=True))
-        shares = Case(number, "clean", NONE, logs).shares(temperature, prior)
-        true = list(shares)[int(rng.choice(len(shares), p=list(shares.values())))]
-        kind = {NONE: "clean", UNKNOWN: "unknown"}.get(true, "single")
-        cases.append(Case(number, kind, true, logs))
-    return cases
+DARK, HALO, GLOW = ("offset_place", "dark_offset"), ("psf", "wide_halo"), ("light_place", None)
+TRUE = {"cause": "dark_offset", "families": ["offset_place"]}
+WITHHELD = {"cause": None, "families": ["light_place", "light_time"]}
 
 
-def test_the_true_share_and_the_temperature_of_the_cases_are_found() -> None:
-    shares = {NONE: 0.2, UNKNOWN: 0.1, A: 0.3, AB: 0.4}
-    # A pair that the data do not show is counted to its effect; the second effect is then in no hypothesis.
-    idle = {NONE: 0.2, UNKNOWN: 0.1, A: 0.6, AB: 0.1}
-    for weights, true, share in ((shares, B, 0.4), (shares, NONE, 0.2), (idle, A, 0.7), (idle, AB, 0.0)):
-        logs = {names: math.log(weight) for names, weight in weights.items()}
-        assert Case(0, "single", true, logs).true_share(1.0) == pytest.approx(share), (weights, true)
-    for temperature in (1.0, 3.0):
-        found = calibrated(drawn_cases(200, temperature), {"seed": 5})
-        assert found.temperature == pytest.approx(temperature, rel=0.2)
-        assert len(found.true_shares) == 200 and list(found.true_shares) == sorted(found.true_shares)
-        assert found.about == {"seed": 5}
-    # A case whose true cause was left out counts with a share of zero.
-    lost = Case(0, "single", A, {NONE: 0.0, B: -1.0})
-    found = calibrated([lost, *drawn_cases(19, 1.0)], {})
-    assert found.true_shares[0] == 0.0
-    assert found.threshold(0.9) > 0.0 == found.threshold(0.95)
+def report(*rows: tuple[float, tuple[str, str | None]]) -> dict[str, Any]:
+    """A report with one hypothesis for each label, and the rest of the probability for no cause."""
+    causes = [
+        {"causes": [{"family": f, "effect": effect}], "probability": share} for share, (f, effect) in rows
+    ]
+    return {"hypotheses": [*causes, {"causes": [], "probability": 1 - sum(share for share, _ in rows)}]}
+
+
+def test_the_smallest_level_that_covers_a_true_cause() -> None:
+    for rows, effect, level in (
+        ([(0.95, DARK), (0.04, HALO)], TRUE, 0.3),
+        ([(0.6, HALO), (0.39, DARK)], TRUE, 0.61),
+        ([(0.95, GLOW), (0.04, HALO)], WITHHELD, 0.3),
+        ([(0.95, HALO), (0.04, GLOW)], WITHHELD, 0.96),
+        ([(0.95, HALO), (0.04, DARK)], WITHHELD, MISSED),
+        ([(0.5, DARK), (0.1, HALO)], TRUE, None),  # no gap is detected
+    ):
+        shares = {
+            frozenset((one["family"], one["effect"]) for one in row["causes"]): row["probability"]
+            for row in report(*rows)["hypotheses"]
+        }
+        found = smallest_level(shares, {"effects": [{"cause": "ghost", "families": ["ghost"]}, effect]})
+        assert found == (None if level is None else pytest.approx(level, abs=0.011)), (rows, effect)
+    cases: list[tuple[dict[str, Any], dict[str, Any]]] = [
+        (report((0.6, HALO), (0.39, DARK)), {"effects": [TRUE]}),
+        (report((0.99, DARK)), {"effects": [TRUE]}),
+        (report((0.99, DARK)), {"effects": []}),
+        (report((0.1, DARK)), {"effects": [TRUE]}),
+    ]
+    assert calibrated(cases) == pytest.approx([0.3, 0.61], abs=0.011)

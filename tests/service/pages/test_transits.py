@@ -119,7 +119,7 @@ def test_a_gap_report_is_shown_with_its_sentence_map_sections_and_figures(
     places = [
         page.index(text)
         for text in (
-            gap["sentence"][:16],
+            gap["lines"][0][:16],
             "What was found",
             "The discs, on the",
             "Where the gap lies",
@@ -130,7 +130,7 @@ def test_a_gap_report_is_shown_with_its_sentence_map_sections_and_figures(
     assert page.count("<circle") == sum(image["residual_pct"] is not None for image in gap["images"]) > 5
     tags = read_page(page)  # every tag is closed in the right order
     assert next(t.text for t in tags if t.name == "h1").startswith("Gap between model and images of")
-    assert next(t.text.replace("\xa0", " ") for t in tags if t.name == "strong") == gap["sentence"]
+    assert next(t.text.replace("\xa0", " ") for t in tags if t.name == "strong") == gap["lines"][0]
     assert {"h2", "dt", "figcaption", "summary", "td"} <= {t.name for t in tags}
     assert "data:image" not in page and "style=" not in page and "<style" not in page
     download = api.get(f"/v1/reports/{GAP_ID}/page").text

@@ -74,7 +74,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
 def test_the_report_names_the_effect_its_size_and_the_inputs(made: dict[str, Any]) -> None:
     row, report = made["row"], made["json"]
     assert row["kind"] == "gap" and row["html"] == f"/v1/reports/{row['id']}/page"
-    assert report["schema"] == "gap/2" and report["verdict"] == "attributed"
+    assert report["schema"] == "gap/3" and report["verdict"] == "attributed"
     assert report["answer"] == row["details"]["answer"] == ["dark_offset"]
     offset = report["effects"][0]["parameters"]["offset"]
     assert offset["value"] == pytest.approx(small_gaps.OFFSET_DN, abs=4 * offset["sigma"])
@@ -82,7 +82,8 @@ def test_the_report_names_the_effect_its_size_and_the_inputs(made: dict[str, Any
     assert row["details"]["strongest_axis"] == report["where"][0]["axis"]
     provenance = report["provenance"]
     assert provenance["seed"] == provenance["parameters"]["seed"] == 3
-    assert provenance["parameters"]["coverage"] == report["set"]["coverage"] == 0.9
+    assert provenance["parameters"]["coverage"] == COVERAGE <= report["level"]
+    assert row["details"]["lines"] == report["lines"]
     assert provenance["started_from_psf"] is None and provenance["added_effects"] == {}
     assert {"numpy", "scipy", "numba", "astropy"} <= set(provenance["libraries"])
     assert report["inputs_sha256"] == small_gaps.with_offset().sha256
@@ -169,7 +170,9 @@ def test_a_request_chooses_coverage(service: InProcess, transit: Path, asked: li
     assert [how["coverage"] for how in asked] == [0.5, COVERAGE]
     assert row["details"]["corrected_psf_id"] is None and ids(service, PsfRow) == before
     for coverage in (0.5, 0.95):
-        assert 0 <= shipped_calibration().threshold(coverage) <= 1, "the shipped calibration has enough cases"
+        assert coverage <= shipped_calibration().level(coverage) <= 1, (
+            "the shipped calibration has enough cases"
+        )
     for coverage in (0.49, 0.96):
         with pytest.raises(ValueError, match="coverage"):
             GapDiagnose(transit_id="a" * 64, coverage=coverage)

@@ -84,7 +84,7 @@ def test_p_values_of_noise_are_uniform(solution: Solution) -> None:
 
 
 def test_the_p_value_of_a_gap_is_hardly_ever_small_for_noise(evidence: Evidence) -> None:
-    """The smallest of four p-values times four is at least as large as a uniform number."""
+    """The smallest of three p-values times three is at least as large as a uniform number."""
     draws = 50
     model = LinearModel(evidence, FLOOR)
     values = np.array([p_value_of_gap(drawn(model, {}, seed)) for seed in range(draws)])

@@ -10,7 +10,6 @@ import scipy.linalg
 from scipy.stats import multivariate_normal
 
 from psfcore.gap.evidence.cells import cells_of, disc_cells, sensitivities
-from psfcore.gap.evidence.effect_fits import means
 from psfcore.gap.evidence.evidence import Evidence, gather
 from psfcore.gap.evidence.linear_model import FLOOR, UNLIKELY, LinearModel
 from psfcore.gap.library.detector import EFFECTS
@@ -70,20 +69,6 @@ def test_the_prior_also_counts_what_was_subtracted_from_the_images(evidence: Evi
     total = 300.0 + step.values - left.pull_of_prior(step, taken_out)
     assert whole.values[first] < 399.0  # the prior, of 20 DN, holds it back
     assert total[first] == pytest.approx(whole.values[first], rel=1e-6)
-
-
-def test_the_gain_of_means_is_that_of_a_free_brightness_of_each_disc(evidence: Evidence) -> None:
-    model = LinearModel(evidence, 0.003)
-    columns = [*evidence.base, *evidence.columns["dark_offset"]]
-    step = model.fit(evidence.columns["dark_offset"])
-    design = np.concatenate([disc.jacobian[columns] for disc in model.discs], axis=1)
-    levels = [white.white @ disc.expected for disc, white in zip(evidence.discs, model.discs, strict=True)]
-    own = scipy.linalg.block_diag(*levels)
-    left = np.concatenate(model.left(step))
-    fall = chi2_left(design.T, left) - chi2_left(np.vstack([design, own]).T, left)
-    gain, directions = model.gain_of_patterns(step, means(model.evidence), model.left(step))
-    assert gain == pytest.approx(fall, rel=1e-3)
-    assert len(model.discs) - len(columns) <= directions <= len(model.discs)
 
 
 def test_blocks_recover_an_added_effect_whatever_the_brightness(evidence: Evidence) -> None:

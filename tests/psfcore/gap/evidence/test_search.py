@@ -182,7 +182,7 @@ def test_the_direction_of_a_directional_blur_is_found() -> None:
 
 
 def by_whole_field(image: np.ndarray, n: int) -> np.ndarray:
-    """The response of the cells of disc n to an image, by sensitivities of the whole field, without the disc's brightness."""
+    """The response of the cells of disc n to an image, by sensitivities of the whole field, without its brightness."""
     place, dark = solution().sky.found[n].place, solution().sky.dark[n]
     cells = cells_of(dark, place.x_px, place.y_px)
     planes = sensitivities(solution().optics, dark, cells.weights)

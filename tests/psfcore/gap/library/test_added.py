@@ -82,6 +82,7 @@ def test_an_error_in_a_source_is_reported_with_its_name(tmp_path: Path) -> None:
         "x = 1\ny = x + z\n": "NameError: name 'z' is not defined (line 2)",
         GLOW.replace('"a dark exposure", ', ""): "missing 1 required positional argument",
         GLOW.replace("edge_glow", "edge glow"): "letters, digits and _; got 'edge glow'",
+        GLOW.replace("glow),)", "glow, family='lamps'),)"): "edge_glow: expected a family of ",
         GLOW.replace(
             '(EffectParameter("height", "DN/s", 5.0),)', "()"
         ): "edge_glow: expected at least one parameter",
@@ -104,7 +105,7 @@ def test_an_error_in_a_source_is_reported_with_its_name(tmp_path: Path) -> None:
 def test_a_change_that_is_not_an_image_is_reported_when_it_is_computed(tmp_path: Path) -> None:
     ny, nx = solution().transit.shape
     changes = {
-        "plane[1:]": f"edge_glow: expected an image of shape ({ny}, {nx}) [y, x]; got an array of shape ({ny - 1}, {nx})",
+        "plane[1:]": f"edge_glow: expected an image of shape ({ny}, {nx}) [y, x]; got an array of shape ({ny - 1}, ",
         "plane * np.nan": "got an image with NaN or infinite values",
         "plane / nothing": "NameError: name 'nothing' is not defined (line 8)",
     }

@@ -43,3 +43,16 @@ def test_an_effect_declares_itself_and_its_changes_are_finite() -> None:
         lost = change.change(0, images)
         assert lost.min() < 0 and lost.max() <= 0
         assert abs(lost).max() <= images[0].max()
+
+
+def test_a_ghost_moves_grows_and_turns() -> None:
+    """The changes beside the copy are minus its slopes along the displacements."""
+    copy, *moves = (
+        change.change(3, view().expected).astype(np.float64) for change in effect("ghost").changes(view())
+    )
+    along_x, along_y = ((np.roll(copy, 1, axis) - np.roll(copy, -1, axis)) / 2 for axis in (1, 0))
+    x, y = (place.astype(np.float64) for place in view().places)
+    expected = (along_x, along_y, x * along_x + y * along_y, x * along_y - y * along_x)
+    for moved, right in zip(moves, expected, strict=True):
+        inside = (slice(2, -2), slice(2, -2))
+        np.testing.assert_allclose(moved[inside], right[inside], atol=1e-5 * copy.max())

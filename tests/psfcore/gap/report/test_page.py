@@ -14,22 +14,15 @@ from matplotlib.figure import Figure
 
 from psfcore.drawing.page import with_error
 from psfcore.gap.diagnose import Diagnosis
+from psfcore.gap.evidence.tree import FAMILIES
 from psfcore.gap.report import plot as gap_plot
 from psfcore.gap.report.page import gap_page, interval_words, unit_words
-from psfcore.gap.report.plot import cell_means, draw_effects, draw_map, gap_png, simulated_of
-from psfcore.gap.report.report import gap_report, hypothesis_words, percent_words
+from psfcore.gap.report.plot import cell_means, draw_effects, draw_map, field_png, gap_png, simulated_of
+from psfcore.gap.report.report import gap_report, label_words, percent_words
 from psfcore.gap.verdict.limits import Alike
-from psfcore.gap.verdict.posterior import UNKNOWN
 from tests.blank_figures import blank_figures
 from tests.html_page import check_stands_alone, read_page
-from tests.psfcore.gap.posteriors import FIELD
-from tests.psfcore.gap.report.judged import (
-    HOLDS_FOR,
-    LEAST,
-    OFFSET_BLUR,
-    SHARES,
-    judged,
-)
+from tests.psfcore.gap.report.judged import GIVEN, HOLDS_FOR, LEVEL, judged
 from tests.psfcore.gap.small_gaps import OFFSET_DN, found
 
 MADE_BY = {"software_version": "1.2.3", "seed": 5, "libraries": {"numpy": "9.9"}, "started_from_psf": None}
@@ -97,24 +90,25 @@ def test_the_page_needs_no_other_file_and_shows_the_numbers_of_the_report() -> N
     check_stands_alone(html())
     report, said = report_of(found()), values(html())
     (lead,) = (t.text for t in read_page(html()) if t.attributes.get("class") == "lead")
-    assert lead.replace("\xa0", " ") == report["sentence"]
+    assert lead.replace("\xa0", " ") == report["lines"][0]
+    assert all(line in texts(html(), "p") for line in report["lines"][1:])
     assert said["verdict"] == "attributed" and said["named effects"] == "dark offset"
     gap = report["gap"]
     for name, key in (
         ("gap before the refit", "before_refit_pct"),
         ("gap, PSF refitted", "rms_pct"),
-        ("gap with the named effects in the model", "after_pct"),
+        ("gap with the told causes in the model", "after_pct"),
     ):
         assert said[name] == f"{interval_words(gap[key])} %"
     unseen = values(page_of(replace(found(), rms=replace(found().rms, value=0.04))))
-    assert unseen.keys() == said.keys() - {"gap with the named effects in the model"}
+    assert unseen.keys() == said.keys() - {"gap with the told causes in the model"}
     assert float(said["noise"].split()[0]) == pytest.approx(gap["noise_pct"], rel=0.05)
     names = [name.split()[0] for name in pictures(html())]
     assert names == ["Map", "Residuals", "Bars", "Map", "Bars", "Observed"]
     rows = rows_of(html())
     tested = {row[0]: row for row in rows if len(row) == EFFECT_COLUMNS}
     for effect in report["effects"]:
-        row = tested[effect["name"].replace("_", " ")]
+        row = tested[effect["words"]]
         assert row[1] == percent_words(effect["probability"])
         for name, p in effect["parameters"].items():
             assert f"{name} {with_error(p['value'], p['sigma'])}" in row[2]
@@ -134,51 +128,44 @@ def test_the_page_needs_no_other_file_and_shows_the_numbers_of_the_report() -> N
     assert "ab" * 32 in {cell for row in rows for cell in row} and said["libraries: numpy"] == "9.9"
 
 
-@pytest.mark.parametrize("verdict", list(SHARES))
-def test_every_verdict_is_explained_on_its_page(verdict: str, blank: None) -> None:
-    diagnosis = judged(verdict)
-    page = page_of(diagnosis)
+@pytest.mark.parametrize("kind", list(GIVEN))
+def test_every_kind_of_answer_is_explained_on_its_page(kind: str, blank: None) -> None:
+    given, diagnosis = GIVEN[kind], judged(kind)
+    page, report = page_of(diagnosis), report_of(diagnosis)
     check_stands_alone(page)
-    text, said, answered = text_of(page), values(page), verdict in ("attributed", "tie")
-    assert said["verdict"] == verdict
+    text, said, rows = text_of(page), values(page), rows_of(page)
+    assert said["verdict"] == given.verdict and said["level"] == f"{100 * LEVEL:.0f} %"
+    assert all(line in text for line in report["lines"])
     # Slices are shown only if an effect was added to the model, bars of closure only if there is a gap.
-    assert any(name.startswith("Observed") for name in pictures(page)) is answered
-    assert ("Bars of held-out closure by effect" in pictures(page)) is (verdict != "none")
-    unknown = UNKNOWN in diagnosis.judgement.members
-    assert ("The most probable field of an unknown cause" in pictures(page)) is unknown
-    assert any(row[:3] == [FIELD.words, "detector", "> 99 %"] for row in rows_of(page)) is unknown
-    # The hypotheses, and for which data the coverage holds.
-    assert HOLDS_FOR in text and "19 simulated transits" in text and "in 90 % of the cases" in text
-    rows = rows_of(page)
-    for names, share in SHARES[verdict].items():
-        assert [hypothesis_words(names), percent_words(share), "yes" if share >= LEAST else ""] in rows
-    assert said["answer set"] == "; ".join(map(hypothesis_words, diagnosis.judgement.members))
-    assert said["probability of no gap"] == percent_words(SHARES[verdict][()])
-    name = "most probable effects" if verdict == "inconclusive" else "named effects"
-    assert said[name] == (", ".join(diagnosis.judgement.answer).replace("_", " ") or "none")
+    assert not any(name.startswith("Observed") for name in pictures(page))
+    assert ("Bars of held-out closure by effect" in pictures(page)) is (given.verdict != "none")
+    assert ("The shape of the change" in pictures(page)) is (kind in ("map", "curve", "beside"))
+    # The causes, the hypotheses, and for which data the coverage holds.
+    for number, cause in enumerate(report["causes"], 1):
+        for one in cause["alternatives"]:
+            row = [str(number), one["words"], one["stage"], FAMILIES[one["family"]].words]
+            assert [*row, percent_words(one["probability"])] in rows
+    for labels, share in given.shares.items():
+        told = " together with ".join(label_words(*label) for label in sorted(labels, key=str)) or "no cause"
+        assert [told, percent_words(share)] in rows
+    assert HOLDS_FOR in text and "19 simulated transits" in text
+    assert said["probability of no cause"] == percent_words(given.shares.get((), 0.0))
+    name = "most probable effects" if given.verdict == "inconclusive" else "named effects"
+    assert said[name] == (", ".join(given.named).replace("_", " ") or "none")
 
 
 def test_what_has_no_picture_is_told_in_words(blank: None) -> None:
-    diagnosis = judged("unknown")
-    report = report_of(diagnosis)
-    drawn = "The most probable field of an unknown cause"
-    assert drawn in pictures(gap_page(diagnosis, report))
-    for field in report["unknown"]["fields"]:
-        field.pop("map", None)
-        field.pop("curve", None)
-    page = gap_page(diagnosis, report)
-    assert drawn not in pictures(page) and report["unknown"]["fields"][0]["form"] in text_of(page)
     assert "No two effects are closer than 3 sigma" in text_of(html())
-    pair = Alike(OFFSET_BLUR, 1.4, "a series of exposure times")
+    pair = Alike(("dark_offset", "core_blur"), 1.4, "a series of exposure times")
     page = page_of(replace(found(), limits=replace(found().limits, alike=(pair,))))
     assert ["dark offset and core blur", "1.40", "a series of exposure times"] in rows_of(page)
     assert "No two effects are closer" not in text_of(page)
-    few = replace(judged("none"), residual=None, unknown=())
+    few = replace(judged("none"), residual=None)
     page = page_of(few)
     check_stands_alone(page)
     assert "No image could be held out" in text_of(page)
     assert len(pictures(page)) == 2
-    for diagnosis in (few, found()):
+    for diagnosis in (few, found(), judged("map"), judged("curve")):
         assert gap_png(diagnosis, report_of(diagnosis)).startswith(b"\x89PNG")
 
 
@@ -216,6 +203,8 @@ def test_the_map_shows_every_disc_at_its_place_and_bars_show_closure() -> None:
     assert "-4.0" in [text.get_text() for text in axes.texts]
     assert "<" in [line.get_marker() for line in axes.lines]
     assert axes.get_yticklabels()[0].get_text() == "dark offset  (named)"
+    for kind in ("map", "curve"):
+        assert field_png(report_of(judged(kind))).startswith(b"\x89PNG")
 
 
 def test_cells_show_means_of_all_discs() -> None:
@@ -234,7 +223,8 @@ def test_a_simulated_image_with_the_answer_contains_the_effect() -> None:
     diagnosis = found()
     n = diagnosis.evidence.discs[0].index
     frame, dark = diagnosis.solution.transit.frames[n], diagnosis.solution.sky.dark[n]
-    added = diagnosis.corrected[0].solution
+    assert diagnosis.corrected is not None
+    added = diagnosis.corrected.solution
     np.testing.assert_allclose(simulated_of(diagnosis, n)[dark], diagnosis.solution.residual(n)[1], rtol=1e-5)
     offset = frame.pixels - added.transit.frames[n].pixels
     assert offset[dark].mean() == pytest.approx(OFFSET_DN / frame.exposure_s, rel=0.15)

@@ -81,27 +81,33 @@ def test_closure_its_interval_gap_and_fall_by_hand() -> None:
     first = replace(before, deviance={(0,): 30.0, (1,): 20.0})
     assert fall(first, replace(after, deviance={(0,): 12.0, (2,): 1.0})) == 18.0
 
-    def found(after: HeldOut, scale_error: float = 0.0, blocks: float = 0.0) -> tuple[float, float, float]:
+    def interval_of(
+        after: HeldOut, scale_error: float = 0.0, blocks: float = 0.0
+    ) -> tuple[float, float, float]:
         interval = closure(of_images(110.0, 10.0, blocks), after, np.random.default_rng(1), scale_error)
         assert interval is not None
         return interval.low, interval.value, interval.high
 
     # All images are equal, so the interval contains only the error of form.
-    same = found(of_images(30.0, 10.0))
+    same = interval_of(of_images(30.0, 10.0))
     assert same == pytest.approx((0.80, 0.80, 0.80 + FORM_ERROR**2))
     # Of the remaining 20, 15 come from errors of the parameters.
-    assert found(of_images(30.0, 25.0))[1:] == pytest.approx((0.80, 1.0))
+    assert interval_of(of_images(30.0, 25.0))[1:] == pytest.approx((0.80, 1.0))
     # If all of it comes from one direction, it is often more than its mean: up to 3.8 times.
     one_direction = {tuple(range(6)): (np.array([30.0]), np.array([30.0]))}  # the sum over six images is 30
-    low, value, high = found(replace(of_images(60.0, 15.0), spread=one_direction))
+    low, value, high = interval_of(replace(of_images(60.0, 15.0), spread=one_direction))
     assert value == pytest.approx(0.50)
     assert high == pytest.approx(0.50 + 3.84 * 30 / 600 + FORM_ERROR**2, abs=0.02)
     # A noise scale with an error of 20 % widens the interval on both sides.
-    low, _, high = found(of_images(30.0, 10.0), 0.2)
+    low, _, high = interval_of(of_images(30.0, 10.0), 0.2)
     assert low < same[0] - 0.02 and same[2] + 0.02 < high <= 1
     # The unocculted blocks count if they show more of the gap and the effect explains them.
-    for before, after, closed in ((900.0, 0.0, 0.9), (90.0, 0.0, 0.0), (900.0, 800.0, 0.0)):
-        assert found(of_images(110.0, 10.0, after), blocks=before)[1] == pytest.approx(closed), before
+    for shown, left, closed in ((900.0, 0.0, 0.9), (90.0, 0.0, 0.0), (900.0, 800.0, 0.0)):
+        assert interval_of(of_images(110.0, 10.0, left), blocks=shown)[1] == pytest.approx(closed), shown
+    # No cause closes more than the gap: what an estimate is above 1 widens the interval, which contains 1.
+    assert interval_of(of_images(4.0, 10.0)) == pytest.approx((1.0, 1.0, 1.0))
+    low, *others = interval_of(of_images(4.0, 10.0), 0.2)
+    assert low < 0.98 and others == [1.0, 1.0]
 
 
 def test_shares_of_axes_are_averages_over_orders_and_the_axis_of_a_gap_is_first(evidence: Evidence) -> None:

@@ -104,7 +104,7 @@ def test_a_share_of_light_cannot_be_negative() -> None:
 
 
 def test_a_subtracted_effect_scales_with_the_brightness_of_the_image() -> None:
-    """A copy in every image, and brightness that varies by 2 %: after subtraction the images of a pointing agree as well."""
+    """A copy in every image, and brightness that varies by 2 %: after subtraction the images agree as well."""
     rng = np.random.default_rng(4)
 
     def copied(n: int, images: Sequence[Any]) -> Any:
