@@ -10,7 +10,6 @@ the macros of ``drawing/parts.html``. Names of templates are paths below the fol
 from __future__ import annotations
 
 import base64
-import math
 import re
 import struct
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,10 +21,10 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup, escape
 
+from psfcore.drawing.numbers import with_error
 from psfcore.errors import DataError
 
 PNG_START = b"\x89PNG\r\n\x1a\n"
-DASH = "\N{EN DASH}"
 PLOT_DPI = 160  # resolution of the figures on a page: sharp on screens of high resolution and on paper
 CSS_DPI = 96  # CSS pixels per inch: a figure is shown at the size (in inches) at which it was drawn
 
@@ -56,22 +55,6 @@ def render(template: str | Template, **values: Any) -> str:
             next_table=count(1).__next__,
         )
     )
-
-
-def with_error(value: float | None, sigma: float | None = None) -> str:
-    """A number rounded to the second digit of its error, "12.34 ± 0.56". Without an error it is rounded to five digits.
-
-    None and numbers that are not finite give a dash.
-    """
-    if value is None or not math.isfinite(value):
-        return DASH
-    if sigma is None or not math.isfinite(sigma) or sigma <= 0:
-        return f"{value:.5g}"
-    if abs(value) >= 1e6 or max(abs(value), sigma) < 1e-3:
-        return f"{value:.3e} ± {sigma:.1e}"
-    digits = max(0, 1 - math.floor(math.log10(sigma)))
-    rounded = round(value, digits) + 0.0  # + 0.0 turns -0.0 into 0.0
-    return f"{rounded:.{digits}f} ± {sigma:.{digits}f}"
 
 
 def named_texts(values: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str]]:

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from psfcore.drawing.page import DASH, render, with_error
+from psfcore.drawing.numbers import DASH, with_error
+from psfcore.drawing.page import render
 from psfcore.evaluation.evaluation import (
     CENTRE_PX,
     INVERSION_STEPS,

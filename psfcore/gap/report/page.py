@@ -10,7 +10,8 @@ import re
 import sys
 from typing import Any
 
-from psfcore.drawing.page import DASH, render, with_error
+from psfcore.drawing.numbers import DASH, with_error
+from psfcore.drawing.page import render
 from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.evidence.linear_model import FLOOR
 from psfcore.gap.evidence.tree import FAMILIES

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from psfcore.drawing.page import with_error
+from psfcore.drawing.numbers import with_error
 from psfcore.gap.diagnose import Diagnosis, Shrinking
 from psfcore.gap.evidence.columns import FieldShape, another
 from psfcore.gap.evidence.effect_fits import EffectFit, left_chi2

@@ -14,7 +14,7 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from psfcore.drawing.page import with_error
+from psfcore.drawing.numbers import with_error
 from psfcore.errors import DataError
 from psfcore.evaluation.evaluation import evaluate
 from psfcore.evaluation.shapes import held_out_kernels

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from psfcore.drawing.page import with_error
+from psfcore.drawing.numbers import with_error
 from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.evidence.tree import FAMILIES
 from psfcore.gap.report import plot as gap_plot
