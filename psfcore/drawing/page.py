@@ -21,7 +21,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup, escape
 
-from psfcore.drawing.numbers import with_error
+from psfcore.drawing.numbers import DASH, with_error
 from psfcore.errors import DataError
 
 PNG_START = b"\x89PNG\r\n\x1a\n"
