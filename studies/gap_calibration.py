@@ -4,7 +4,7 @@ The cases have effects of the library, written by another author, and withheld e
 used. Each case is diagnosed from its images alone. From its report follows the smallest level at which the alternatives contain a true
 cause (`psfcore.gap.verdict.calibration`, Eq. (1)). Cases in which no gap is detected do not count.
 
-    python -m studies.gap_calibration -o DIR --cases 96 --seed 502 --write
+    python -m studies.gap_calibration -o DIR --cases 64 --seed 502 --write
 
 --write replaces the calibration that belongs to this version of the library.
 """
@@ -62,7 +62,7 @@ def shares_of(report: Mapping[str, Any]) -> dict[Labels, float]:
 
 @click.command()
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path))
-@click.option("--cases", default=96)
+@click.option("--cases", default=64)
 @click.option("--seed", default=502)
 @click.option("--processes", default=2)
 @click.option("--write", is_flag=True)
