@@ -187,7 +187,8 @@ def covered_share(place: Place, first: tuple[int, int], shape: tuple[int, int], 
 def _area_left_below(x: Plane, y: Plane, r: float) -> Plane:
     """F(x, y), Eq. (3)."""
     x, y = np.broadcast_arrays(np.clip(x, -r, r), np.clip(y, -r, r))
-    half = np.sqrt(r**2 - y**2)  # half the length of the chord at y
+    # y = r can give a square that is larger than r**2 by rounding.
+    half = np.sqrt(np.maximum(r**2 - y**2, 0.0))  # half the length of the chord at y
     middle = np.clip(x, -half, half)
     area = y * (middle + half) + _half_segment(middle, r) - _half_segment(-half, r)
     caps = _half_segment(np.minimum(x, -half), r) - _half_segment(np.full_like(x, -r), r)

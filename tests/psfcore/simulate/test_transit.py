@@ -132,6 +132,13 @@ def test_the_covered_area_is_that_of_the_circle() -> None:
 # --- the PSF ----------------------------------------------------------------------------------------------
 
 
+def test_shares_are_finite_for_every_radius() -> None:
+    """The square of a radius may be smaller than its product with itself, by rounding."""
+    for radius_px in np.random.default_rng(1).uniform(10.3, 11.2, 200):
+        share = covered_share(Place(20.0, 20.0, float(radius_px)), (0, 0), (40, 40))
+        assert np.isfinite(share).all(), radius_px
+
+
 def test_isotropic_scatter_is_the_power_law_and_every_kernel_sums_to_1() -> None:
     expected = scatter_kernel(6.15, 2.53, 0.411, 128)
     np.testing.assert_allclose(anisotropic_kernel(SCATTER, 128), expected, rtol=1e-10)
