@@ -147,6 +147,7 @@ def diagnose(
     view = View(solution)
     model, expected = linear_model_of(view, library, seed=seed, progress=progress)
     progress("hypotheses", 0, 1)
+    return_unused_memory()  # of the simulated transit and its fit
     answer = answer_of(model, level)
     rng = np.random.default_rng(seed)
     told, failures = _told(model, answer), list[str]()

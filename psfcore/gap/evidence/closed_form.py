@@ -308,7 +308,8 @@ class ClosedForm:
         out: dict[Sun | None, _Sums] = {}
         kept, nuisances = np.r_[0:size, size + free : size + free + data], slice(size, size + free)
         steady = 0.0
-        for key, whole in bordered.items():
+        for key in (None, *SUNS):
+            whole = bordered.pop(key)
             lower = cholesky(whole[nuisances, nuisances] + np.eye(free), lower=True)
             across = solve_triangular(lower, whole[nuisances][:, kept], lower=True)
             left = whole[np.ix_(kept, kept)] - across.T @ across
@@ -378,6 +379,10 @@ class ClosedForm:
         shown = np.flatnonzero(self._place[columns] >= 0)
         out[shown] += self._blocks[sun].score[self._place[columns[shown]]] / of_blocks
         return np.asarray(out)
+
+    def forget_suns(self) -> None:
+        """Free the matrices with the Sun in the model, most of the memory. Later calls must not name a Sun."""
+        self._blocks = {None: self._blocks[None]}
 
     def of_sun(self, sun: Sun | None) -> Vector:
         """ln E of the Sun alone, relative to no cause (data,)."""

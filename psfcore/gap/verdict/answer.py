@@ -171,8 +171,9 @@ def answer_of(model: LinearModel, level: float) -> Answer:
         columns = np.concatenate([one.columns for one in exact])
         seen = float(values @ weighed.closed.normal(columns) @ values)
         if FORM_ERROR**2 * seen > VISIBLE:
-            inexact = Inexact(tuple(exact), values)
-            weighed = _Weighed(ClosedForm(model, weighed.closed.columns, inexact=inexact))
+            inexact, fields = Inexact(tuple(exact), values), weighed.closed.columns
+            del weighed  # its matrices, before those of the next closed form are made
+            weighed = _Weighed(ClosedForm(model, fields, inexact=inexact))
             best = weighed.best
     left = weighed.closed.chi2_left(
         [v for v in (weighed.variants[form] for form in best) if v is not None], weighed.sun_of(best)
@@ -180,6 +181,7 @@ def answer_of(model: LinearModel, level: float) -> Answer:
     if max(left) > 1:
         weighed.closed.misfit = (max(left[0], 1.0), max(left[1], 1.0))
         weighed = _Weighed(weighed.closed)
+    weighed.closed.forget_suns()
     shares = weighed.probabilities()
     none = shares.get((), 0.0)
     by_label = _sum((frozenset(map(label_of, forms)), share) for forms, share in shares.items())
