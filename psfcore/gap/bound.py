@@ -121,9 +121,7 @@ def _bound(
     ]
     # The observer knows the true form, so the form of the library is no rival.
     known = [
-        form
-        for form in forms
-        if cause.name is None or form.effect != cause.name or form.field or column in form.columns
+        form for form in forms if cause.name is None or form.effect != cause.name or column in form.columns
     ]
     prior = prior_of(known)
     weights = np.array([np.log(ONE * prior[form]) + closed.of_form(form)[0] for form in known])

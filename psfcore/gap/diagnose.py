@@ -217,7 +217,7 @@ def _told(model: LinearModel, answer: Answer) -> EffectFit | None:
         variant = answer.variant((one.family.name, one.effect))
         if variant is None:
             continue
-        if variant.form.field is None or (one.effect is not None and one.effect in evidence.columns):
+        if variant.form.field is None:
             names.append(str(one.effect))
             continue
         closed, field = answer.closed, variant.form.field

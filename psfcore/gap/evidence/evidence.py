@@ -85,8 +85,7 @@ class Evidence:
 
     effects: the effects that these data can show. columns: the columns of each effect, by its name. base: the columns that
     every fit contains. discs: the cells of each image that the fit used. image_info: the properties of every image,
-    used or not. untestable: the reasons why effects cannot be tested, by name. longest_step: `Parameter.largest_step` of each
-    coordinate of the PSF. box_px: the edge of a box of `DiscCells.boxes`. kernel: the total PSF, summed over boxes. templates: `Effect.distinguished` by effect.
+    used or not. untestable: the reasons why effects cannot be tested, by name. box_px: the edge of a box of `DiscCells.boxes`. kernel: the total PSF, summed over boxes. templates: `Effect.distinguished` by effect.
     """
 
     effects: tuple[Effect, ...]
@@ -96,7 +95,6 @@ class Evidence:
     unocculted: UnoccultedBlocks
     image_info: tuple[ImageInfo, ...]
     untestable: dict[str, str]
-    longest_step: Vector
     box_px: int
     kernel: Matrix
     templates: dict[str, float] = field(default_factory=dict)
@@ -188,7 +186,6 @@ def gather(
         untestable=untestable,
         box_px=box_px(solution.transit.shape),
         kernel=coarse_kernel(view.kernel, box_px(solution.transit.shape)),
-        longest_step=np.array([parameter.largest_step for parameter in solution.inversion.shape.parameters]),
         templates={
             effect.name: effect.distinguished(view) if effect.distinguished else float(effect.trials)
             for effect in library

@@ -205,7 +205,7 @@ def answer_of(model: LinearModel, level: float) -> Answer:
 class _Weighed:
     """ln E of every hypothesis of a closed form.
 
-    alone: of each form. variants: the best variant of each form. pairs, triples: of forms together, in their best variants.
+    alone: of each form. variants: the best variant of each form. together: of two or three forms, in their best variants.
     """
 
     def __init__(self, closed: ClosedForm) -> None:
