@@ -357,7 +357,7 @@ class GapDiagnose(Parameters):
     """Diagnose the gap between an uploaded transit and the model that was fitted to it. The report says how large the gap is,
     where in the data it appears, and which effects explain it."""
 
-    algorithm_version: ClassVar[int] = 17
+    algorithm_version: ClassVar[int] = 18
     transit_id: TransitId
     psf_id: Identity | None = Field(
         None,

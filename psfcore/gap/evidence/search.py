@@ -117,22 +117,26 @@ class PlaceSearch:
         return np.array([np.concatenate([near.of_kernel(one) for near in self._near]) for one in kernels]).T
 
     @cached_property
-    def copy(self) -> tuple[float, int, int]:
-        """The blur (px) and the displacement (whole pixels x, y) of the copy of the image that explains most of the residuals.
+    def copy(self) -> tuple[tuple[float, int, int], float]:
+        """The blur (px) and the displacement (whole pixels x, y) of the copy of the image that explains most of the residuals; and
+        the number of copies that the data distinguish.
 
         A copy is displaced by at least NEAREST_RADII times the radius of the disc. The search uses a coarse grid with one blur,
         then a fine grid around the best displacement with several blurs.
         """
-        dx, dy = self._coarse_displacement
-        best = (-1.0, COARSE_BLUR_PX, dx, dy)
-        for blur_px in BLURS_PX:
-            gain, at_x, at_y = self._fine_displacement(blur_px, dx, dy)
-            best = max(best, (gain, blur_px, at_x, at_y))
-        return best[1:]
+        at, gains = self._coarse_gains
+        best = int(np.argmax(gains))
+        dx, dy = at[best].tolist()
+        found = [(*self._fine_displacement(blur_px, dx, dy), blur_px) for blur_px in BLURS_PX]
+        gain, at_x, at_y, blur_px = max(found)
+        # The means alone tell displacements apart less well than the means and the cells do.
+        sharper = max(gain / max(float(gains[best]), UNSEEN), 1.0)
+        copies = distinguished(gains * sharper) * distinguished(np.array([one[0] for one in found]))
+        return (blur_px, at_x, at_y), copies
 
     @property
-    def _coarse_displacement(self) -> tuple[int, int]:
-        """The displacement (x, y) of the coarse grid with the largest gain."""
+    def _coarse_gains(self) -> tuple[NDArray[np.intp], Vector]:
+        """The displacements of the coarse grid (displacements, 2), x and y, px; and their gains (displacements,)."""
         copies = (gaussian_filter(self._expected[n], COARSE_BLUR_PX) for n in self._images)
         means = np.array(
             [
@@ -140,12 +144,10 @@ class PlaceSearch:
                 for q, copy in zip(self._planes, copies, strict=True)
             ]
         )
-        size = means.shape[1]
-        gain = self._gain(means.reshape(len(means), -1), least=SEEN).reshape(size, size)
-        along = (np.arange(size) - size // 2) * STEP_PX
-        gain[np.hypot(along[:, None], along[None, :]) < self._nearest_px] = -1.0
-        row, column = np.unravel_index(np.argmax(gain), gain.shape)
-        return int(along[column]), int(along[row])
+        along = (np.arange(means.shape[1]) - means.shape[1] // 2) * STEP_PX
+        at = np.stack(np.meshgrid(along, along), axis=-1)
+        far = np.hypot(at[..., 0], at[..., 1]) >= self._nearest_px
+        return at[far], self._gain(means[:, far], least=SEEN)
 
     def _fine_displacement(self, blur_px: float, dx: int, dy: int) -> tuple[float, int, int]:
         """The best gain and its displacement (x, y), among displacements within one coarse step of (dx, dy).

@@ -112,8 +112,7 @@ def _scatter(view: View) -> Kernel:
 
 def _ghost(view: View) -> _Best:
     """A blurred, displaced copy of the image. A search over the field finds the displacement that explains the discs best."""
-    # The coarse grid of the search uses the means of the discs only. How many displacements the cells distinguish is not known, so all count.
-    return _Best(place_search(view).copy, GHOST_TRIALS)
+    return _Best(*place_search(view).copy)
 
 
 def _copy(view: View, blur_px: float, dx: int, dy: int) -> Sequence[Change]:

@@ -2,7 +2,8 @@
 
 The hypotheses are no cause, one form (`closed_form.Form`), and two forms of different families; also two forms and the Sun, because
 the Sun always may change. Their prior: NONE, ONE and TWO; families are equally likely; within a family, half of the
-weight belongs to the effects of the library and half to the fields.
+weight belongs to the effects of the library and half to other forms. A family without fields has other forms too, which no
+hypothesis describes.
 
 **Two priors of the Sun.** In the first, the blocks change independently. In the second, the Sun also changes the brightness of large
 areas, like a gain that changes with place and time, and the edges of the discs, because it changes the places at which the occulters
@@ -309,7 +310,7 @@ def prior_of(forms: Sequence[Form]) -> dict[Form, float]:
     for form in forms:
         mates = [other for other in forms if other.family == form.family]
         alike = [other for other in mates if (other.field is None) == (form.field is None)]
-        out[form] = (1.0 if len(alike) == len(mates) else 0.5) / len(alike) / len(families)
+        out[form] = 0.5 / len(alike) / len(families)
     return out
 
 

@@ -161,7 +161,8 @@ def test_a_copy_is_found_at_its_place_with_its_blur() -> None:
     transit = changed(
         clean(), lambda n, f: f.pixels + 0.06 * displaced(gaussian_filter(f.pixels, 8.0), 24, 16)
     )
-    blur_px, x, y = place_search(View(fit(transit))).copy
+    (blur_px, x, y), copies = place_search(View(fit(transit))).copy
+    assert copies > 10 * place_search(view()).copy[1]  # noise alone prefers no displacement
     assert (x, y) == pytest.approx((24, 16), abs=4) and blur_px in (4.0, 8.0)
 
 
