@@ -14,7 +14,17 @@ from astropy import units
 from astropy.io.fits import Header
 from numpy.typing import NDArray
 
-from heliopsf.inputs import box_of, cut, header_of, image_of, is_many, is_sequence, shape_of, uncertainty_of
+from heliopsf.inputs import (
+    box_of,
+    cut,
+    header_of,
+    image_of,
+    is_many,
+    is_sequence,
+    on_disk,
+    shape_of,
+    uncertainty_of,
+)
 from heliopsf.outputs import Deconvolution, in_form_of
 from heliopsf.parameters import NoiseFigures, Number, Progress, Steps, noise_of, number, reporter, whole
 from heliopsf.psfs import AnyPsf, Psf, built_psf, given_psf
@@ -87,9 +97,9 @@ def deconvolve(  # type: ignore[misc]  # the overloads need not repeat the optio
 
     Parameters
     ----------
-    smap : Map, NDData, NDCube, array, HDU, HDUList, path, Image or list
-        The image. The result is of the same class; for a path or an ``Image`` it is a ``Deconvolution``, for a MapSequence a
-        MapSequence. Pixels that are NaN or masked are not used; they are NaN in the result.
+    smap : Map, NDData, NDCube, array, (array, header), HDU, HDUList, path, bytes, Image or list
+        The image. The result is of the same class; for a path, the bytes of a file or an ``Image`` it is a ``Deconvolution``, for a
+        MapSequence a MapSequence. Pixels that are NaN or masked are not used; they are NaN in the result.
     psf : Psf, path, name, array, optional
         A PSF, its FITS file, the name of a known instrument, an instrument file (TOML), or weights with their centre at
         [ny // 2, nx // 2]. Default: the PSF of the telescope in the header (``psf_for``), without its components. The
@@ -222,11 +232,13 @@ def deconvolve(  # type: ignore[misc]  # the overloads need not repeat the optio
         return result if full else in_form_of(image if box is None else cut(image, box), result)
 
     if not is_many(smap):
-        return one(smap)
+        with on_disk(smap) as image:
+            return one(image)
     images, results = list(smap), []
     for count, image in enumerate(images, start=1):
         try:
-            results.append(one(image))
+            with on_disk(image) as there:
+                results.append(one(there))
         except DataError as error:
             message = f"image {count} of {len(images)}: {error.message}"
             raise type(error)(error.code, message, error.fields) from error
@@ -250,7 +262,8 @@ def psf_for(image: Any, *, threads: int | None = None, progress: Progress = None
     DataError
         "no-psf-for-instrument", "channel-mismatch" or "plate-scale-mismatch".
     """
-    header = header_of(image)
+    with on_disk(image) as image:
+        header = header_of(image)
     psf = _built_for(header, reporter(progress is True, BUILDING), threads=threads or cores(), parts=True)
     for code, message in input_warnings(psf, _header_only(header), None, other_channel=False).items():
         warnings.warn(DataWarning(code, message), stacklevel=2)

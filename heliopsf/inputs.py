@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -24,24 +26,39 @@ from heliopsf.psfs import existing_file
 from psfcore.deconvolve.extent import Box
 from psfcore.errors import DataError, DataWarning
 from psfcore.fits.blocks import LIMITS
-from psfcore.fits.cards import card_trouble
-from psfcore.fits.header import first_image_header, read_summary
-from psfcore.fits.observation import observation_of, read_observation
+from psfcore.fits.cards import card_trouble, long_key, number_of, plain_value
+from psfcore.fits.header import read_first_image, read_summary
+from psfcore.fits.observation import (
+    observation_of,
+    observation_of_hdus,
+    read_observation,
+    real_pixels,
+    stored_bits,
+)
+from psfcore.fits.saturation import with_saturation
+from psfcore.fits.unusable import ERRORS, FLAGS
 from psfcore.fits.viewing.regions import moved_header
 from psfcore.image import Image
 
-_EXPECTED = "a sunpy Map, an NDData, CCDData or NDCube, an array, an HDU or HDUList, a path of a FITS file, or a list of these"
+_EXPECTED = (
+    "a sunpy Map, an NDData, CCDData or NDCube, an array, a pair (array, header), an HDU or HDUList, a path or the bytes of a FITS "
+    "file, or a list of these"
+)
 _HDUS = (fits.PrimaryHDU, fits.ImageHDU, fits.CompImageHDU)
+_UNITS = {
+    "XPOSURE": "s",
+    "EXPTIME": "s",
+    "WAVELNTH": "angstrom",
+}  # of cards that a table may hold as quantities
 
 
 @dataclass(frozen=True)
 class _Parts:
-    """An image in memory. data: the pixels, which may not be computed or read yet. uncertainty: of an NDData."""
+    """An image in memory. data: the pixels, which may not be computed yet. planes: as `psfcore.fits.unusable` has them."""
 
     data: Any
     header: Header
-    mask: Any = None
-    uncertainty: Any = None
+    planes: Mapping[str, Any]
 
 
 def is_map(image: Any) -> bool:
@@ -59,14 +76,32 @@ def is_hdu(image: Any) -> bool:
     return isinstance(image, _HDUS)
 
 
+def is_pair(image: Any) -> bool:
+    """Whether an object is an array with its metadata: (array, header or table of cards)."""
+    return isinstance(image, tuple) and len(image) == 2 and isinstance(image[1], Mapping | Header)
+
+
+@contextmanager
+def on_disk(image: Any) -> Iterator[Any]:
+    """The path of a temporary file with the bytes of a FITS file; any other image unchanged."""
+    if not isinstance(image, bytes | bytearray | memoryview):
+        yield image
+        return
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "image.fits"
+        path.write_bytes(image)
+        yield path
+
+
 def is_sequence(image: Any) -> bool:
     """Whether an object is a MapSequence of sunpy."""
     return _is_of(image, "sunpy.map", "MapSequence")
 
 
 def is_many(image: Any) -> bool:
-    """Whether an object is a list of images: a list, a tuple or a MapSequence."""
-    return (isinstance(image, list | tuple) and not isinstance(image, fits.HDUList)) or is_sequence(image)
+    """Whether an object is a list of images: a list, a tuple, what ``Fido.fetch`` returns, or a MapSequence."""
+    one = isinstance(image, str | bytes | bytearray | memoryview | fits.HDUList) or is_pair(image)
+    return (isinstance(image, Sequence) and not one) or is_sequence(image)
 
 
 def _is_of(image: Any, module: str, name: str) -> bool:
@@ -81,18 +116,20 @@ def image_of(image: Any, *, saturation: Any, hdu: int | None = None) -> Image:
     Pixels that the mask excludes are pixels without a value. Raises ``DataError`` "bad-input" for another
     kind of object, "bad-unit" for a logarithmic unit, and the errors of reading an image.
     """
-    if isinstance(image, Image):
-        return image
     level = level_dn(saturation, {} if saturation is None else header_of(image, hdu))
+    if isinstance(image, Image):
+        return image if level is None else with_saturation(image, requested_dn=level)
     if isinstance(image, str | Path):
         return read_observation(image, LIMITS, saturation_dn=level, hdu=hdu)
-    parts = _parts_of(image, hdu)
+    if is_hdu(image) or isinstance(image, fits.HDUList):
+        number, hdus = _chosen(image, hdu)
+        return observation_of_hdus(hdus, number, chosen=hdu, saturation_dn=level)
+    parts = _parts_of(image)
     data = _computed(parts.data)
-    pixels = _pixels(data)
-    if parts.mask is not None and np.any(parts.mask):
-        pixels = np.where(np.asarray(parts.mask, dtype=bool), np.nan, pixels)
+    pixels = real_pixels(data)
+    planes = {name: np.asarray(plane) for name, plane in parts.planes.items() if plane is not None}
     return observation_of(
-        pixels, parts.header, saturation_dn=level, stored_as_integer=data.dtype.kind in "iu"
+        pixels, parts.header, bits=stored_bits(data, parts.header), planes=planes, saturation_dn=level
     )
 
 
@@ -127,7 +164,10 @@ def shape_of(image: Any, hdu: int | None = None) -> tuple[int, int]:
     """
     if isinstance(image, str | Path):
         return read_summary(existing_file(image), LIMITS, hdu=hdu).shape
-    shape = image.pixels.shape if isinstance(image, Image) else np.shape(_parts_of(image, hdu).data)
+    if is_hdu(image) or isinstance(image, fits.HDUList):
+        shape = hdu_of(image, hdu).shape
+    else:
+        shape = image.pixels.shape if isinstance(image, Image) else np.shape(_parts_of(image).data)
     if len(shape) != 2:
         raise DataError("not-2d", f"expected an image with two axes; got {len(shape)}")
     return shape[0], shape[1]
@@ -141,43 +181,61 @@ def header_of(image: Any, hdu: int | None = None) -> Header:
     if isinstance(image, Image):
         return image.header
     if isinstance(image, str | Path):
-        return first_image_header(existing_file(image), LIMITS)
+        return read_first_image(existing_file(image), LIMITS, hdu=hdu)[1].header
     if isinstance(image, Header):
         return image
-    return _header(image) if isinstance(image, Mapping) else _parts_of(image, hdu).header
+    if is_hdu(image) or isinstance(image, fits.HDUList):
+        return hdu_of(image, hdu).header.copy()
+    return _header(image) if isinstance(image, Mapping) else _parts_of(image).header
 
 
-def hdu_of(hdus: fits.HDUList, number: int | None = None) -> Any:
-    """The HDU with this number, or the first one with an image of two axes. Raises ``DataError`` "no-image"."""
-    with_image = [n for n, one in enumerate(hdus) if is_hdu(one) and len(one.shape) == 2]
-    numbers = with_image[:1] if number is None else [n for n in with_image if n == number]
-    if not numbers:
-        raise DataError(
-            "no-image",
-            f"expected an HDU with an image of two axes; got {len(hdus)} HDUs, images in {with_image}: "
-            + ("choose one of these" if with_image else "use a file with an image"),
-        )
-    return hdus[numbers[0]]
+def hdu_of(image: Any, number: int | None = None) -> Any:
+    """An HDU, or that of an HDUList as `_chosen` chooses it."""
+    chosen, hdus = _chosen(image, number)
+    return hdus[chosen]
 
 
-def _parts_of(image: Any, hdu: int | None = None) -> _Parts:
+def _chosen(image: Any, number: int | None) -> tuple[int, dict[int, Any]]:
+    """The number of the HDU, or of the first one with an image of two axes; and all such HDUs by their numbers.
+
+    Raises ``DataError`` "three-axes" if an image of more axes comes first, "no-image" and "not-2d".
+    """
+    hdus = list(image) if isinstance(image, fits.HDUList) else [image]
+    images = {n: one for n, one in enumerate(hdus) if is_hdu(one) and len(one.shape) == 2}
+    for n, one in enumerate(hdus):
+        wanted = n == number or (number is None and is_hdu(one) and len(one.shape) > 0)
+        if wanted and n in images:
+            return n, images
+        if wanted and is_hdu(one):
+            many = len(one.shape) > 2 and len(hdus) > 1
+            raise DataError(
+                "three-axes" if many else "not-2d",
+                f"expected an image with two axes; HDU {n} has {len(one.shape)}: choose another HDU, or one plane of it",
+            )
+    raise DataError(
+        "no-image",
+        f"expected an HDU with an image of two axes; got {len(hdus)} HDUs, images in {list(images)}: "
+        + ("choose one of these" if images else "use a file with an image"),
+    )
+
+
+def _parts_of(image: Any) -> _Parts:
     """An image in memory with its header. Raises ``DataError`` "bad-input" and "bad-unit"."""
-    if isinstance(image, fits.HDUList):
-        image = hdu_of(image, hdu)
-    if is_hdu(image):
-        return _Parts(image.data if image.shape else np.empty(()), image.header.copy())
-    unit, header = getattr(image, "unit", None), Header()
+    image, meta = image if is_pair(image) else (image, {})
+    unit, header = getattr(image, "unit", None), _header(meta)
     if is_nddata(image):
         header = _header(image.meta)
         if not is_map(image):
             _add_coordinates(header, image.wcs)
-        parts = _Parts(image.data, header, image.mask, image.uncertainty)
+        kind = getattr(image.uncertainty, "uncertainty_type", None)
+        errors = image.uncertainty.array if kind in ("std", "var") else None
+        parts = _Parts(image.data, header, {FLAGS[0]: image.mask, ERRORS[0]: errors})
     elif isinstance(image, np.ndarray):
         plain = getattr(image, "unmasked", image)
         plain = plain.value if isinstance(plain, units.Quantity) else plain
-        parts = _Parts(np.asarray(plain), header, getattr(image, "mask", None))
+        parts = _Parts(np.asarray(plain), header, {FLAGS[0]: getattr(image, "mask", None)})
     elif _is_of(image, "dask.array", "Array"):
-        parts = _Parts(image, header)
+        parts = _Parts(image, header, {})
     else:
         raise DataError("bad-input", f"expected {_EXPECTED}; got {type(image).__name__}")
     if "BUNIT" in header:
@@ -217,14 +275,6 @@ def unit_text(unit: Any) -> str | None:
     return str(unit) or None
 
 
-def _pixels(data: NDArray[Any]) -> NDArray[np.float64]:
-    if data.dtype.kind not in "iufb":
-        raise DataError("bad-input", f"expected pixels that are real numbers; got the type {data.dtype}")
-    if data.ndim != 2:
-        raise DataError("not-2d", f"expected an image with two axes; got {data.ndim}")
-    return np.asarray(data, dtype=np.float64)
-
-
 def _header(meta: Mapping[str, Any]) -> Header:
     """The cards of a table. Values that no card can hold are left out: such values do not describe the observation."""
     if isinstance(meta, Header):
@@ -232,10 +282,15 @@ def _header(meta: Mapping[str, Any]) -> Header:
     header = Header()
     for key, value in meta.items():
         name = str(key).upper()
-        if name in ("KEYCOMMENTS", "HISTORY", "COMMENT", "SIMPLE", "END", ""):
+        if name in ("KEYCOMMENTS", "COMMENT", "SIMPLE", "END", ""):
             continue
         try:
-            header[name] = value
+            if isinstance(value, units.Quantity):
+                value = value.to_value(_UNITS.get(name, value.unit))
+            for line in str(value).splitlines() if name == "HISTORY" else ():
+                header.add_history(line)
+            if name != "HISTORY":
+                header[long_key(name)] = plain_value(value)
         except card_trouble():
             continue
     return header
@@ -286,14 +341,11 @@ def cut(image: Any, box: Box) -> Any:
         corners = ((box.x0, box.y0), (box.x1 - 1, box.y1 - 1))
         bottom_left, top_right = (list(corner) * units.pix for corner in corners)
         return image.submap(bottom_left, top_right=top_right)
+    rows, columns = box.slices
     if is_nddata(image):
-        rows, columns = box.slices
-        meta = image.meta
         return type(image)(
             image.data[box.slices],
-            meta=moved_header(meta, columns, rows)
-            if isinstance(meta, Header)
-            else _moved(meta, columns, rows),
+            meta=_moved(image.meta, columns, rows),
             mask=None if image.mask is None else image.mask[box.slices],
             wcs=_part_of(image.wcs, box),
             unit=image.unit,
@@ -301,8 +353,9 @@ def cut(image: Any, box: Box) -> Any:
     if isinstance(image, fits.HDUList):
         return fits.HDUList([cut(hdu_of(image), box)])
     if is_hdu(image):
-        rows, columns = box.slices
         return type(image)(image.data[box.slices], moved_header(image.header, columns, rows))
+    if is_pair(image):
+        return image[0][box.slices], _moved(image[1], columns, rows)
     return image
 
 
@@ -317,13 +370,15 @@ def _part_of(wcs: Any, box: Box) -> Any:
     return SlicedLowLevelWCS(wcs.low_level_wcs, box.slices)
 
 
-def _moved(meta: Mapping[str, Any], columns: slice, rows: slice) -> dict[str, Any]:
-    """A table of cards for these columns and rows."""
+def _moved(meta: Mapping[str, Any] | Header, columns: slice, rows: slice) -> Any:
+    """A header or a table of cards for these columns and rows."""
+    if isinstance(meta, Header):
+        return moved_header(meta, columns, rows)
     moved = dict(meta)
     for key, value in meta.items():
         name = str(key).upper()
-        if name.startswith("CRPIX") and isinstance(value, int | float):
-            moved[key] = value - (columns if name[5:6] == "1" else rows).start
+        if name.startswith("CRPIX") and (at := number_of(value)) is not None:
+            moved[key] = at - (columns if name[5:6] == "1" else rows).start
     return moved
 
 

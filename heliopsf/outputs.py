@@ -16,7 +16,7 @@ from astropy.io.fits import Header
 from astropy.utils.masked import Masked
 from numpy.typing import NDArray
 
-from heliopsf.inputs import hdu_of, is_hdu, is_map, is_nddata
+from heliopsf.inputs import hdu_of, is_hdu, is_map, is_nddata, is_pair
 from heliopsf.psfs import Psf, Shown
 from psfcore.deconvolve.run import Product, UsedPsf, deconvolution_cards, deconvolution_history
 from psfcore.deconvolve.summary import summary_lines
@@ -105,6 +105,8 @@ def in_form_of(image: Any, result: Deconvolution) -> Any:
         return kind(result.pixels, _described(image.header, result))
     if isinstance(image, str | Path | Image):
         return result
+    if is_pair(image):
+        return in_form_of(image[0], result), _described(image[1], result)
     pixels: Any = result.pixels
     if isinstance(image, np.ma.MaskedArray):
         return np.ma.MaskedArray(pixels, result.mask)

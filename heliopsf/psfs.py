@@ -15,7 +15,7 @@ from astropy import units
 from heliopsf.parameters import Progress, Steps, radii_px, reporter, whole
 from psfcore.deconvolve.run import BUILDING
 from psfcore.errors import DataError, MissingExtra, did_you_mean, module_of_extra
-from psfcore.files import sha256_of
+from psfcore.files import check_ending, sha256_of, whole_path
 from psfcore.fits import psfs
 from psfcore.fits.blocks import LIMITS
 from psfcore.fits.header import utc_time
@@ -81,9 +81,14 @@ class Psf(Shown, CorePsf):
         return Psf.of(rebinned(self, whole("factor", factor, "bad-binning")))
 
     def write(self, path: str | Path) -> None:
-        """Write the PSF and its components to a FITS file, which every function and command reads."""
+        """Write the PSF and its components to a FITS file, which every function and command reads.
+
+        A file whose name ends in .gz is written in gzip. Raises ``OSError``, also for a name that ends in .fz.
+        """
         toml = self.provenance.get("instrument_toml")
-        psfs.write_psf(path, self, instrument_file=None if toml is None else str(toml).encode())
+        check_ending(Path(path))
+        with whole_path(Path(path)) as partial:
+            psfs.write_psf(partial, self, instrument_file=None if toml is None else str(toml).encode())
 
     def plot(self, axes: Axes | None = None, *, size: int = 129) -> Axes:
         """Draw the central ``size`` px on a logarithmic scale. Needs the extra "plot". axes None: new axes."""

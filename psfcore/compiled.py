@@ -12,15 +12,18 @@ kernel depends on all source files that define kernels. If a power failure left 
 ignored.
 
 A kernel file contains machine code, and loading it executes it. Therefore a folder is used only if nobody else can write
-to it; otherwise the kernels are kept in a private folder in the user's home.
+to it; otherwise the kernels are kept in a private folder of the user's cache. If there is none either, each process
+compiles the kernels again.
 """
 
 from __future__ import annotations
 
 import hashlib
+import inspect
 import logging
 import os
 import stat
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
@@ -29,10 +32,17 @@ from pathlib import Path
 from typing import Any
 
 from numba import njit
-from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.caching import (
+    CompileResultCacheImpl,
+    FunctionCache,
+    IndexDataCacheFile,
+    UserWideCacheLocator,
+)
 from numba.core.ccallback import CFunc
 from numba.core.dispatcher import Dispatcher
 from numba.core.runtime import rtsys
+
+from psfcore.files import CACHE_VARIABLE, cache_folder
 
 # The function that is called when this thread compiles a kernel. A new thread has no listener, so a kernel that another
 # thread of a job compiles is not reported.
@@ -59,7 +69,7 @@ def compiled(
             )
         function.__qualname__ = name or function.__qualname__
         # Without the wrapper for callers in C: nothing calls it, and it takes time to compile.
-        options.update(nogil=True, cache=True, no_cfunc_wrapper=True)
+        options.update(nogil=True, no_cfunc_wrapper=True)
         kernel: Any = njit(**options)(function)
         if isinstance(kernel, Dispatcher):  # it is a plain function if compilation is switched off
             kernel._cache = KernelCache(function)  # type: ignore[attr-defined]
@@ -101,8 +111,33 @@ def compiled_at_address(
     return decorate
 
 
+class _Private(UserWideCacheLocator):
+    """The private folder for kernels. It may not exist: `KernelFiles` checks it."""
+
+    def get_cache_path(self) -> str:
+        """The path of the folder."""
+        return str(private_folder())
+
+    def ensure_cache_path(self) -> None:
+        """Do nothing."""
+
+
+class _Place(CompileResultCacheImpl):
+    """The folder that numba chooses for the machine code of a function; the private one if it can write to none."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        try:
+            super().__init__(function)
+        except RuntimeError:  # numba found no folder, and would not even compile the function
+            self._locator = _Private(function, inspect.getfile(function))
+            name = f"{function.__module__}.{function.__qualname__}"
+            self._filename_base = self.get_filename_base(name, getattr(sys, "abiflags", ""))
+
+
 class KernelCache(FunctionCache):
     """Keeps the machine code of one function in `KernelFiles`."""
+
+    _impl_class = _Place
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
@@ -145,31 +180,39 @@ def _tell(*, done: bool) -> None:
 
 
 @cache
-def kernel_folder(usual: Path, home: Path | None = None) -> str:
-    """The folder for kernels: `usual` if nobody else can write to it, otherwise a private folder below `home`.
+def kernel_folder(usual: Path) -> str:
+    """The folder for kernels: `usual` if nobody else can write to it, otherwise a private folder of the user's cache.
 
-    home: default: the user's home. If the private folder cannot be made, `KernelFiles` neither writes nor reads
-    kernels.
+    If the private folder cannot be made, `KernelFiles` neither writes nor reads kernels.
     """
-    with suppress(OSError):  # numba would make the folder later; a folder that cannot be made is not trusted
-        usual.mkdir(parents=True, exist_ok=True)
     if trusted(usual):
         return str(usual)
-    source = hashlib.sha256(str(SOURCE).encode()).hexdigest()[:12]
-    private = (home or Path.home()) / ".cache" / "heliopsf" / f"kernels-{source}"
-    log.warning(
-        "expected a folder for compiled kernels to which nobody else can write; other users can write to %s, or it cannot be "
-        "made: the kernels are kept in %s",
-        usual,
-        private,
-    )
-    try:
+    private = private_folder()
+    with suppress(OSError):  # a folder that cannot be made is not trusted
         private.mkdir(mode=0o700, parents=True, exist_ok=True)
-    except OSError as error:
-        log.warning(
-            "cannot make the folder %s; each process will compile the kernels again: %s", private, error
-        )
     return str(private)
+
+
+def private_folder() -> Path:
+    """The folder of the user's cache for the kernels of this installation; it may not exist."""
+    return cache_folder() / f"kernels-{hashlib.sha256(str(SOURCE).encode()).hexdigest()[:12]}"
+
+
+def folder_of_kernels() -> tuple[Path, bool]:
+    """The folder of the compiled kernels of this package, and whether kernels can be kept there."""
+    folder = Path(KernelCache(trusted)._cache_file._cache_path)
+    return folder, trusted(folder) and os.access(folder, os.W_OK | os.X_OK)
+
+
+@cache
+def _tell_not_kept(folder: str, reason: object) -> None:
+    log.warning(
+        "compiled kernels cannot be kept in %s (%s), so each process compiles them again, which takes longer: set "
+        "NUMBA_CACHE_DIR or %s to a folder to which nobody else can write",
+        folder,
+        reason,
+        CACHE_VARIABLE,
+    )
 
 
 def trusted(path: Path) -> bool:
@@ -209,23 +252,17 @@ class KernelFiles(IndexDataCacheFile):
     """
 
     def save(self, key: Any, data: Any) -> None:
-        """Write a kernel to disk in one step. If this fails, log a warning; the kernel can still be used."""
+        """Write a kernel to disk in one step. If this fails, log a warning once; the kernel can still be used."""
         _tell(done=True)
         if not trusted(Path(self._cache_path)):
-            log.warning(
-                "expected a folder for compiled kernels to which nobody else can write; got %s: each process will compile "
-                "them again",
-                self._cache_path,
-            )
+            _tell_not_kept(self._cache_path, "it cannot be made, or others can write to it")
             return
         payload = self._dump(data)
         try:
             with self._open_for_write(self._data_path(self._name(key))) as file:
                 file.write(payload + self._seal(payload))
         except OSError as error:
-            log.warning(
-                "cannot write a compiled kernel to disk; each process will compile it again: %s", error
-            )
+            _tell_not_kept(self._cache_path, error.strerror)
 
     def load(self, key: Any) -> Any:
         """The kernel for this key, compiled from the current sources; None if it is not on disk and must be

@@ -25,7 +25,7 @@ class MaskBit(IntFlag):
 
 @dataclass(frozen=True)
 class Saturation:
-    """How the saturated pixels of an image were found, see `psfcore.fits.observation`.
+    """How the saturated pixels of an image were found, see `psfcore.fits.saturation`.
 
     level: the saturation level in the unit of the image; None: unknown. found: the source of the level: a card,
     "request", "instrument file" or "pixels". warning: a sentence for the user if pixels may be marked wrongly.

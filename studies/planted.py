@@ -79,7 +79,7 @@ FAULTS = (
           'if dy**2 + dx**2 <= radius_px**2', 'if dy**2 + dx**2 < radius_px**2'),
     Fault("deconvolve-region-shares-inverted", "psfcore/deconvolve/work.py",
           '* light.kept - light.light) / light.shares', '* light.kept - light.light) * light.shares'),
-    Fault("fits-saturation-level-itself-unmasked", "psfcore/fits/observation.py",
+    Fault("fits-saturation-level-itself-unmasked", "psfcore/fits/saturation.py",
           'mask[image.pixels >= level]', 'mask[image.pixels > level]'),
     Fault("fits-psf-centre-half-a-pixel-off", "psfcore/fits/psfs.py",
           '(size // 2 + 1.0, ', '(size / 2 + 0.5, '),

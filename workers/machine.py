@@ -12,15 +12,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from platformdirs import user_cache_path
-
 from psfcore.errors import DataError
+from psfcore.files import cache_folder
 from psfcore.psf_cache import PsfCache
 
 CGROUPS = Path("/sys/fs/cgroup")
 MEMBERSHIP = Path("/proc/self/cgroup")
 MEMINFO = Path("/proc/meminfo")
-FOLDER, LARGEST = "HELIOPSF_CACHE_DIR", "HELIOPSF_CACHE_MIB"
+LARGEST = "HELIOPSF_CACHE_MIB"
 DEFAULT_MIB = 2048  # about 15 PSFs of 2048 px with their components
 _PSFS, _PUBLISHED = (
     "psfs",
@@ -120,14 +119,9 @@ def psf_cache() -> PsfCache:
         raise DataError(
             "bad-setting", f"{LARGEST}: expected a whole number of MiB, 0 for no cache; got {largest!r}"
         )
-    return PsfCache(_folder() / _PSFS, int(largest) * 2**20)
+    return PsfCache(cache_folder() / _PSFS, int(largest) * 2**20)
 
 
 def published_folder() -> Path:
     """The folder of published PSFs (`psfcore.published_psfs`), beside the cache of built PSFs. Users may share it."""
-    return _folder() / _PUBLISHED
-
-
-def _folder() -> Path:
-    named = os.environ.get(FOLDER)
-    return Path(named).expanduser() if named else user_cache_path("heliopsf", appauthor=False)
+    return cache_folder() / _PUBLISHED

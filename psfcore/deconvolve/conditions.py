@@ -131,6 +131,10 @@ class PreparedPsfs:
         self.max_bytes = max_bytes
         self._kept: OrderedDict[Hashable, tuple[object, int]] = OrderedDict()
 
+    def __reduce__(self) -> tuple[type[PreparedPsfs], tuple[int]]:
+        # A copy, also in another process, is empty: engines hold threads and buffers, and are made again when needed.
+        return PreparedPsfs, (self.max_bytes,)
+
     def as_built(self, key: Hashable, read: Callable[[], Psf]) -> Psf:
         """The PSF that `read` returns; repeated calls with the same key return the same object."""
         return self._once(key, read, _kernel_bytes)

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 import numpy as np
 from astropy.io.fits import Header
 
-from psfcore.compiled import is_kept
+from psfcore.compiled import folder_of_kernels, is_kept
 from psfcore.convolution import engine
 from psfcore.convolution.fft_kernels import make_plan
 from psfcore.convolution.lengths import LARGEST_LENGTH, good_length
@@ -30,11 +30,11 @@ SIZE_PX = 32
 
 @contextmanager
 def compiling_beside(method: str, shape: tuple[int, int]) -> Iterator[None]:
-    """In the block, the kernels of a method are compiled by another process, if they are not kept on disk yet.
+    """In the block, another process compiles the kernels of a method, if they are not kept on disk yet, but can be.
 
     shape: (ny, nx) of the image. The block ends when the process has ended. If the process fails, this process compiles the kernels later.
     """
-    if is_kept(engine._rows_forward):
+    if is_kept(engine._rows_forward) or not folder_of_kernels()[1]:
         yield
         return
     quiet = subprocess.DEVNULL

@@ -6,6 +6,8 @@ IAU FITS working group 2018), section 4.4.
 
 from __future__ import annotations
 
+import re
+from decimal import Decimal
 from functools import cache
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -16,6 +18,9 @@ if TYPE_CHECKING:
 
 LARGEST_COUNT = 2**63 - 1
 LONGEST_TEXT = 68  # characters of a card's value
+LONGEST_KEY = 8  # characters of a keyword without HIERARCH
+LARGEST_NUMBER = 1e300
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d{1,3})?")
 
 
 class Cards(Protocol):
@@ -89,13 +94,32 @@ def optional_text(header: Cards, *keys: str) -> str | None:
     return None
 
 
+def plain_value(value: object) -> object:
+    """The Python value of a scalar of numpy; other values unchanged. The web process does not load numpy."""
+    return value.item() if hasattr(value, "item") and getattr(value, "size", 1) == 1 else value
+
+
+def long_key(key: str) -> str:
+    """A keyword as astropy takes it without a warning: keywords of more than 8 characters need HIERARCH."""
+    return key if len(key) <= LONGEST_KEY else f"HIERARCH {key}"
+
+
+def number_of(value: object, *, text: bool = True) -> float | None:
+    """A finite number, as a card, a table in memory or numpy holds it; None for anything else. text: also a number as text."""
+    if isinstance(value, str):
+        if not text or not _NUMBER.fullmatch(value.strip()):
+            return None
+        value = float(re.sub("[dD]", "e", value))
+    value = plain_value(value)
+    if isinstance(value, bool) or not isinstance(value, (int, float, Decimal)):
+        return None
+    return float(value) if -LARGEST_NUMBER < value < LARGEST_NUMBER else None
+
+
 def optional_number(header: Cards, *keys: str) -> float | None:
     """The value of the first of the cards `keys` that holds a finite number; None if no card does."""
-    for key in keys:
-        value = lenient_value(header, key)
-        if isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300:
-            return float(value)
-    return None
+    found = (number_of(lenient_value(header, key)) for key in keys)
+    return next((number for number in found if number is not None), None)
 
 
 def optional_value(header: Cards, key: str) -> str | float | bool | None:
@@ -103,7 +127,7 @@ def optional_value(header: Cards, key: str) -> str | float | bool | None:
     value = lenient_value(header, key)
     if isinstance(value, bool):
         return value
-    number = optional_number(header, key)
+    number = number_of(value, text=False)
     return optional_text(header, key) if number is None else number
 
 

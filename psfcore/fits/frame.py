@@ -28,6 +28,7 @@ from psfcore.fits.cards import Cards, optional_number, optional_text
 
 _ARCSEC_PER_UNIT = {"arcsec": 1.0, "arcmin": 60.0, "deg": 3600.0, "degree": 3600.0, "rad": 206264.80624709636}
 # Turns below this angle are not mentioned. Where no card states the roll of the detector, pointing errors are allowed for.
+FINEST_ARCSEC = 0.01  # per px; no image of the Sun is finer
 SILENT_DEG = 0.3
 SILENT_WITHOUT_ROLL_DEG = 1.0
 _MAP_AXES = ("CRLN", "HGLN", "CRLT", "HGLT", "RA--", "DEC-")
@@ -78,10 +79,13 @@ class Frame:
 
 def frame_of(header: Cards) -> Frame:
     """The frame that the cards of an image describe."""
-    units = [
-        _ARCSEC_PER_UNIT.get((optional_text(header, f"CUNIT{k}") or "arcsec").lower()) for k in (1, 2)
-    ]  # None: a unit that is no angle
     matrix = _matrix(header)
+    units = [
+        _ARCSEC_PER_UNIT.get(
+            (optional_text(header, f"CUNIT{k}") or _unit_without_card(header, matrix)).lower()
+        )
+        for k in (1, 2)
+    ]  # None: a unit that is no angle
     if matrix is None:
         return Frame((None, None), UNIT, roll_known=False, interpolated=_interpolated(header))
     (a, b), (c, d) = (
@@ -99,6 +103,13 @@ def frame_of(header: Cards) -> Frame:
         (cosine * c - sine * a, cosine * d - sine * b),
     )  # Eq. (2)
     return Frame(scales, on_detector, roll is not None, _interpolated(header))
+
+
+def _unit_without_card(header: Cards, matrix: Matrix | None) -> str:
+    """The unit of an axis without CUNIT: degrees if the axes are celestial (FITS standard, section 8.2), but many headers mean arcsec."""
+    celestial = (optional_text(header, "CTYPE1") or "")[4:5] == "-"
+    fine = matrix is not None and max(abs(one) for row in matrix for one in row) < FINEST_ARCSEC
+    return "deg" if celestial and fine else "arcsec"
 
 
 def plate_scale_arcsec(header: Cards, axis: int = 1) -> float | None:

@@ -69,13 +69,15 @@ PIXEL_TROUBLE = (
 class StoredImage:
     """Pixels [y, x] (float64) and header of an image, as its file has them.
 
-    others: the images that follow in the file, with their shapes, if they were asked for; without planes of products.
+    others: the images that follow in the file, with their shapes, if they were asked for; without planes of products. damaged: whether
+    the card DATASUM contradicts the data.
     """
 
     summary: HeaderSummary
     pixels: NDArray[np.float64]
     header: fits.Header
     others: tuple[tuple[Hdu, tuple[int, int]], ...] = ()
+    damaged: bool = False
 
 
 def read_pixels(
@@ -92,7 +94,8 @@ def read_pixels(
         hdus = walk(source, limits)
         image = first_image(hdus, limits, hdu)
         header, summary = image.header, summary_of(image, gzipped=source.gzipped)
-        plain = None if summary.codec is not None else _plain_pixels(source, image, summary)
+        sums = Sum32()
+        plain = None if summary.codec is not None else _plain_pixels(source, image, summary, sums)
         skip_data(source, image, limits)
         # What follows an image is not needed to use it, so damage there is no error.
         with suppress(HeaderError):
@@ -100,15 +103,37 @@ def read_pixels(
                 if one.kind == "image" and not is_plane(one):
                     further.append((one, shape_of(one.header)))
     if plain is not None:
-        return StoredImage(summary, plain, header, tuple(further))
-    decoded = _decoded_pixels(path, summary, twice=may_hold_unwritten_memory(header))
+        return StoredImage(summary, plain, header, tuple(further), sums.contradicts(header))
+    decoded, damaged = _decoded_pixels(path, summary, twice=may_hold_unwritten_memory(header))
     # The header of the image is that of the table without the cards of its tiles.
     header = fits.Header([card for card in header.cards if not TABLE_CARD.fullmatch(card.keyword)])
-    return StoredImage(summary, decoded, header, tuple(further))
+    return StoredImage(summary, decoded, header, tuple(further), damaged)
 
 
-def _plain_pixels(source: Source, image: Hdu, summary: HeaderSummary) -> NDArray[np.float64]:
-    """The pixels of a plain image, from a source that stands at its data. FITS standard 4.0, Eqs. (3) and (4)."""
+class Sum32:
+    """The checksum of data units: the sum of their words of 32 bits in ones' complement. FITS standard 4.0, Appendix J."""
+
+    def __init__(self) -> None:
+        self._total, self._rest = 0, b""
+
+    def add(self, data: bytes) -> None:
+        """Add the next bytes."""
+        data = self._rest + data
+        whole = len(data) // 4
+        self._total += int(np.frombuffer(data, ">u4", whole).sum(dtype=np.uint64))
+        self._rest = data[4 * whole :]
+
+    def contradicts(self, header: fits.Header) -> bool:
+        """Whether the card DATASUM of this header is another checksum."""
+        stated = optional_number(header, "DATASUM")
+        total = self._total + int.from_bytes(self._rest.ljust(4, b"\0"), "big")  # the padding of images is 0
+        while total >> 32:
+            total = (total & 0xFFFFFFFF) + (total >> 32)
+        return stated not in (None, 0, float(total))
+
+
+def _plain_pixels(source: Source, image: Hdu, summary: HeaderSummary, sums: Sum32) -> NDArray[np.float64]:
+    """The pixels of a plain image, from a source that stands at its data. FITS standard 4.0, Eqs. (3) and (4). sums: gets the bytes."""
     ny, nx = summary.shape
     _ = image.end  # raises the errors of its declared size
     stored = np.dtype(_TYPES[summary.bitpix])
@@ -122,6 +147,7 @@ def _plain_pixels(source: Source, image: Hdu, summary: HeaderSummary) -> NDArray
                 "truncated-data",
                 f"expected {nx} x {ny} pixels in HDU {summary.hdu}; the file ends too early: copy the file again",
             )
+        sums.add(raw)
         rows[...] = np.frombuffer(raw, stored).reshape(rows.shape)
     scale, zero = (optional_number(image.header, key) for key in ("BSCALE", "BZERO"))
     blank = optional_number(image.header, "BLANK") if summary.bitpix > 0 else None
@@ -135,7 +161,10 @@ def _plain_pixels(source: Source, image: Hdu, summary: HeaderSummary) -> NDArray
     return pixels
 
 
-def _decoded_pixels(path: str | Path, summary: HeaderSummary, *, twice: bool) -> NDArray[np.float64]:
+def _decoded_pixels(
+    path: str | Path, summary: HeaderSummary, *, twice: bool
+) -> tuple[NDArray[np.float64], bool]:
+    """The pixels of a tile-compressed image, and whether DATASUM contradicts its tiles."""
     with TemporaryFile() as target:
         about = run_limited(
             decode_tiles,
@@ -148,13 +177,13 @@ def _decoded_pixels(path: str | Path, summary: HeaderSummary, *, twice: bool) ->
         )
         target.seek(0)
         stored = np.fromfile(target, _NUMBERS[about["type"]])
-    return stored.reshape(summary.shape).astype(np.float64)
+    return stored.reshape(summary.shape).astype(np.float64), bool(about["damaged"])
 
 
 def decode_tiles(
     target: BinaryIO, *, path: str, number: int, shape: list[int], twice: bool
 ) -> dict[str, Any]:
-    """Write the pixels of a tile-compressed image to ``target``; returns the type of its numbers.
+    """Write the pixels of a tile-compressed image to ``target``; returns the type of its numbers, and whether DATASUM contradicts its tiles.
 
     twice: decode twice with different contents of new memory, to find pixels that astropy did not write. Call this in a limited
     process (`psfcore.limited`). Raises DataError "unreadable-pixels".
@@ -173,8 +202,10 @@ def decode_tiles(
                     "unreadable-pixels",
                     f"expected all {shape} pixels in HDU {number}; its tiles do not hold them all: copy or make the file again",
                 )
+        with fits.open(path, memmap=False, disable_image_compression=True) as hdus:
+            damaged = hdus[number].verify_datasum() == 0
     target.write(np.ascontiguousarray(data, data.dtype.newbyteorder("=")).data)
-    return {"type": data.dtype.name}
+    return {"type": data.dtype.name, "damaged": damaged}
 
 
 def _tiles(path: str, number: int) -> NDArray[Any]:

@@ -31,10 +31,7 @@ if TYPE_CHECKING:
 JsonValue = str | int | float | bool | None
 # WAVEUNIT is the name of a unit, or an exponent: -10 means 1e-10 m.
 _ANGSTROM_PER_UNIT = {
-    "angstrom": 1.0,
-    "a": 1.0,
-    "0.1nm": 1.0,
-    "-10": 1.0,
+    **dict.fromkeys(("angstrom", "angstroms", "ang", "aa", "a", "å", "0.1nm", "-10"), 1.0),
     "nm": 10.0,
     "-9": 10.0,
     "um": 1e4,
@@ -53,10 +50,10 @@ FILTER_CARDS = ("FILTER", "EC_FW1_", "EC_FW2_")
 # The cards that are compared to find out whether a PSF and an image fit together.
 ORIGIN_CARDS = ("TELESCOP", "OBSRVTRY", "INSTRUME", "DETECTOR", *FILTER_CARDS)
 _FIT_CARDS = (
-    *ORIGIN_CARDS, "PSFDOI", "PSFREF", "WAVELNTH", "WAVEUNIT", "GAINCOMB", "PSFNAME", "LVL_NUM", "LEVEL",
+    *ORIGIN_CARDS, "PSFDOI", "PSFREF", "WAVELNTH", "WAVEUNIT", "WAVE_LEN", "GAINCOMB", "PSFNAME", "LVL_NUM", "LEVEL",
     # The cards that `psfcore.fits.frame` reads.
     "CDELT1", "CDELT2", "CUNIT1", "CUNIT2", "CTYPE1", "CTYPE2", "CD1_1", "CD1_2", "CD2_1", "CD2_2", "PC1_1", "PC1_2",
-    "PC2_1", "PC2_2", "CROTA", "CROTA1", "CROTA2", "SAT_ROT", "INST_ROT", "P2_ROLL",
+    "PC2_1", "PC2_2", "CROTA", "CROTA1", "CROTA2", "SAT_ROT", "INST_ROT", "P2_ROLL", "SC_ROLL",
 )  # fmt: skip
 
 
@@ -194,7 +191,7 @@ def wavelength_angstrom(header: Cards) -> float | None:
     if value is None and of_trace is not None and of_trace.isdecimal():
         value = float(of_trace)
     power = optional_number(header, "WAVEUNIT")
-    unit = optional_text(header, "WAVEUNIT") or ("angstrom" if power is None else f"{power:g}")
+    unit = (optional_text(header, "WAVEUNIT") or "angstrom") if power is None else f"{power:g}"
     factor = _ANGSTROM_PER_UNIT.get(unit.replace(" ", "").lower())
     return None if value is None or value <= 0 or factor is None else value * factor
 
@@ -235,10 +232,8 @@ def seen_by(header: Cards) -> dict[str, Any]:
 
 
 def _pair(header: Header, stem: str) -> tuple[int, int] | None:
-    first, second = (lenient_value(header, f"{stem}{axis}") for axis in (1, 2))
-    if isinstance(first, int) and isinstance(second, int):
-        return int(first), int(second)
-    return None
+    first, second = (optional_number(header, f"{stem}{axis}") for axis in (1, 2))
+    return None if first is None or second is None else (int(first), int(second))
 
 
 def shape_of(header: Header) -> tuple[int, int]:

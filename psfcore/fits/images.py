@@ -41,7 +41,7 @@ from numpy.typing import NDArray
 
 from psfcore.errors import DataError, module_of_extra
 from psfcore.fits.blocks import FitsLimits
-from psfcore.fits.cards import card_trouble, optional_number, optional_text, optional_value
+from psfcore.fits.cards import card_trouble, long_key, optional_number, optional_text, optional_value
 from psfcore.fits.hdus import TABLE_CARD, ascii_text, read_pixels, write_hdus
 from psfcore.fits.header import PRODUCT, content_of
 from psfcore.image import Image
@@ -239,7 +239,9 @@ def _readable(card: fits.Card) -> fits.Card | None:
     try:
         value = _card_value(card)
         copy = fits.Card(
-            card.keyword, ascii_text(value) if isinstance(value, str) else value, ascii_text(card.comment)
+            long_key(card.keyword),
+            ascii_text(value) if isinstance(value, str) else value,
+            ascii_text(card.comment),
         )
         copy.verify("silentfix")
         fits.Card.fromstring(copy.image)

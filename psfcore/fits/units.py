@@ -23,8 +23,10 @@ _MANY_DIGITS = re.compile(r"\d{4}")
 _WORDS = {
     **dict.fromkeys(("dn", "adu", "ct", "cts", "count", "counts"), "ct"),
     **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), "s"),
-    **dict.fromkeys(("pix", "pixel", "pixels"), "pix"),
+    **dict.fromkeys(("pix", "px", "pixel", "pixels"), "pix"),
+    "per": "/",
 }
+_NO_UNIT = ("none", "unitless", "dimensionless", "n/a")
 # Marks of units that are not proportional to the light. Pixels in such units cannot be deconvolved.
 _NOT_LINEAR = ("log", "sqrt", "mag", "dex", "db", "**0.5", "^0.5", "**(1/2)")
 _UNKNOWN = "unit unknown"
@@ -59,7 +61,7 @@ def unit_of(header: Cards) -> PixelUnit:
 @cache
 def parse_unit(text: str | None) -> PixelUnit:
     """The unit that a text names."""
-    if text is None or not text.strip():
+    if text is None or text.strip().lower() in ("", *_NO_UNIT):
         return PixelUnit(None, "unknown")
     from astropy import units
 
@@ -120,6 +122,7 @@ def _parsed(text: str) -> Any:
 
     if _MANY_DIGITS.search(text):  # a large power would take long to compute
         return None
+    text = re.sub(r"data numbers?", "DN", text, flags=re.IGNORECASE)
     plain = re.sub(r"[A-Za-z]+", lambda word: _WORDS.get(word[0].lower(), word[0]), text)
     first, *others = re.sub(r"[{}]", "", plain).split("/")
     if len(others) > 1 and "(" not in plain:  # astropy warns about "DN/s/pixel"

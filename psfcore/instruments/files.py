@@ -10,6 +10,7 @@ import tomllib
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from psfcore.errors import DataError, did_you_mean
 
@@ -18,6 +19,7 @@ WAVELENGTH_TOLERANCE = 0.01
 PLATE_SCALE_TOLERANCE = 0.01
 # The numbers in the table [match] may differ from those of an image by this ratio.
 _TOLERANCES = {"WAVELNTH": WAVELENGTH_TOLERANCE, "CDELT1": PLATE_SCALE_TOLERANCE}
+_MOST_DOTS = 64  # a part of the file without brackets, commas or line ends may contain this number of dots
 _FOLDER = Path(__file__).parent
 # Names of telescopes whose files match a card that does not name the spacecraft.
 _TELESCOPES = {"HRI_EUV": "Solar Orbiter EUI/HRI_EUV", "EUVI": "STEREO/EUVI"}
@@ -38,6 +40,15 @@ def instrument_path(name: str) -> Path:
     return _FOLDER / f"{name}.toml"
 
 
+def parse_toml(text: str) -> dict[str, Any]:
+    """The tables of a TOML text, which may begin with a byte order mark. Raises ValueError, RecursionError."""
+    # The parser's time grows with the square of a dotted key's length: 64 kB of "a.a.a" would take half a minute.
+    for stretch in re.split(r"[^\w\"'. \t-]", text):
+        if stretch.count(".") > _MOST_DOTS:
+            raise ValueError(f"a key may have at most {_MOST_DOTS} parts; got {stretch.strip()[:40]!r} ...")
+    return tomllib.loads(text.removeprefix("\ufeff"))  # Windows editors write the mark
+
+
 def turned_text(name: str, turn_deg: float) -> str:
     """The text of the file of instrument `name` for images that are turned by this angle against the detector."""
     return f"turn_deg = {turn_deg:.2f}\n{instrument_path(name).read_text('utf-8')}"
@@ -55,7 +66,7 @@ def telescopes() -> dict[str, str]:
     """The telescopes that the shipped files describe, with their channels in angstrom, such as "94 to 335"."""
     by_telescope: dict[str, list[float]] = {}
     for name in instrument_names():
-        angstrom = tomllib.loads(instrument_path(name).read_text("utf-8"))["wavelength_angstrom"]
+        angstrom = parse_toml(instrument_path(name).read_text("utf-8"))["wavelength_angstrom"]
         by_telescope.setdefault(telescope_of(name), []).append(angstrom)
     ends = {name: dict.fromkeys((min(channels), max(channels))) for name, channels in by_telescope.items()}
     return {name: " to ".join(f"{channel:g}" for channel in channels) for name, channels in ends.items()}
@@ -89,7 +100,7 @@ def match_instrument(cards: Mapping[str, object]) -> str | None:
 @cache
 def match_table(name: str) -> dict[str, str | float]:
     """The table [match] of the file of instrument `name`: header cards and their values; empty if there is none."""
-    return dict(tomllib.loads(instrument_path(name).read_text("utf-8")).get("match", {}))
+    return dict(parse_toml(instrument_path(name).read_text("utf-8")).get("match", {}))
 
 
 def _same(card: object, value: str | float, tolerance: float) -> bool:

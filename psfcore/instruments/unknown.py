@@ -169,9 +169,9 @@ def unknown_instrument(header: Mapping[str, Any], psfs: Sequence[Mapping[str, An
     """The error "no-psf-for-instrument" for an image with this header summary (`psfcore.fits.header.HeaderSummary` as a table).
 
     Its fields: `image` is the name of the telescope. `reason` says why heliopsf has no instrument file for a telescope that
-    it recognises; it is None for other telescopes. `instruments` are the instruments whose PSF can be built, sorted by
-    how well they agree with the image. `psfs` are the given PSFs, which could fit. `ways` are the steps that the
-    user can take next. For an instrument, `same` names the properties that agree with the image; `told` also says which
+    it recognises, or which cards the header lacks; otherwise it is None. `instruments` are the instruments whose PSF can
+    be built, sorted by how well they agree with the image. `psfs` are the given PSFs, which could fit. `ways` are the steps
+    that the user can take next. For an instrument, `same` names the properties that agree with the image; `told` also says which
     properties differ.
     """
     telescope = telescope_without_file(header)
@@ -181,15 +181,16 @@ def unknown_instrument(header: Mapping[str, Any], psfs: Sequence[Mapping[str, An
     could = [f"PSF {psf['id']} ({psf['name']})" for psf in psfs] + [
         f"instrument {one['name']}" for one in instruments if {"telescope", "channel"} <= set(one["same"])
     ]
+    reason = telescope.reason if telescope else _lacking(named, instruments, header)
     candidates = f"These could suit the image: {', '.join(could)}. " if could else ""
     return DataError(
         "no-psf-for-instrument",
         f"expected a telescope whose PSF is known, or a PSF; got an image of {_seen(named, telescope, header)}. "
-        f"{_why(telescope)}{candidates}Give a PSF (psf in Python, psf_id in a request, --psf in a command), or fit one to a "
-        "transit",
+        f"{_why(telescope, reason)}{candidates}Give a PSF (psf in Python, psf_id in a request, --psf in a command), "
+        "or fit one to a transit",
         {
-            "image": telescope.name if telescope else named or "this telescope",
-            "reason": telescope.reason if telescope else None,
+            "image": telescope.name if telescope else named or "this image",
+            "reason": reason,
             "instruments": instruments,
             "psfs": list(psfs),
             "ways": _ways(telescope),
@@ -206,10 +207,24 @@ def _seen(named: str, telescope: Telescope | None, header: Mapping[str, Any]) ->
     )
 
 
-def _why(telescope: Telescope | None) -> str:
-    """The reason why a recognised telescope has no instrument file, and the recommended step; with a blank at the end."""
+def _lacking(named: str, instruments: Sequence[Mapping[str, Any]], header: Mapping[str, Any]) -> str | None:
+    """The cards without which the telescope or the channel of an image is not known; None if they are there."""
+    if not named:
+        return "its header names no telescope (cards TELESCOP, INSTRUME)"
+    if header["wavelnth"] is not None or not any("telescope" in one["same"] for one in instruments):
+        return None
+    cards = header.get("cards", {})  # only summaries of files have them
+    given = "".join(f"; got {key} = {cards[key]!r:.40}" for key in ("WAVELNTH", "WAVEUNIT") if key in cards)
+    return (
+        "its header gives no wavelength that can be read: expected a number in the card WAVELNTH, and its unit, such as "
+        f"angstrom or nm, in WAVEUNIT{given}"
+    )
+
+
+def _why(telescope: Telescope | None, reason: str | None) -> str:
+    """The reason why the PSF is not known, and the recommended step; with a blank at the end."""
     if telescope is None:
-        return ""
+        return f"{reason[:1].upper()}{reason[1:]}. " if reason else ""
     recommended = next(iter(telescope.ways.values()), None)
     return f"heliopsf has no instrument file for it: {telescope.reason}. " + (
         f"{recommended}. " if recommended else ""

@@ -26,6 +26,8 @@ from packaging.utils import canonicalize_name
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
+from psfcore.compiled import folder_of_kernels
+from psfcore.files import CACHE_VARIABLE
 from service.cli.operator import sentence
 from service.cli.options import DATA, read_settings
 from service.cli.progress import duration, echo
@@ -67,7 +69,7 @@ class Finding:
 @DATA
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON")
 def doctor(data: Path | None, as_json: bool) -> None:
-    """Check versions, settings, disk, database, broker and workers, and say what to do. If something is broken, the exit status is 1."""
+    """Check versions, settings, kernels, disk, database, broker and workers, and say what to do. If something is broken, the exit status is 1."""
     findings = examine(read_settings(data))
     broken = any(finding.state == "broken" for finding in findings.values())
     if as_json:
@@ -80,7 +82,12 @@ def doctor(data: Path | None, as_json: bool) -> None:
 
 def examine(settings: Settings) -> dict[str, Finding]:
     """The finding about each subject, in the order in which problems should be corrected."""
-    findings = {"versions": versions(), "threads": threads(settings), "storage": storage(settings)}
+    findings = {
+        "versions": versions(),
+        "threads": threads(settings),
+        "kernels": kernels(),
+        "storage": storage(settings),
+    }
     if settings.store_url:
         findings["object store"] = object_store(settings)
     findings["broker"] = broker(settings)
@@ -170,6 +177,17 @@ def threads(settings: Settings, cpu_quota: Path = CPU_QUOTA) -> Finding:
             f"more threads than cores slow each other down: set HELIOPSF_WORKER_THREADS={share}, or start fewer processes"
         )
     return Finding("warning" if advice else "ok", found, "; ".join(advice))
+
+
+def kernels() -> Finding:
+    """Can compiled kernels be kept, so that not every process compiles them?"""
+    folder, keeps = folder_of_kernels()
+    if keeps:
+        return Finding("ok", f"compiled kernels are kept in {folder}")
+    advice = f"set NUMBA_CACHE_DIR or {CACHE_VARIABLE} to a folder to which this user alone can write"
+    return Finding(
+        "warning", f"each process compiles its kernels again: they cannot be kept in {folder}", advice
+    )
 
 
 def storage(settings: Settings) -> Finding:

@@ -322,7 +322,7 @@ class Local(Operations):
         return fields
 
     def _resolved_deconvolution(self, request: Deconvolve) -> ResolvedDeconvolve:
-        summary = self._images[request.image_id].summary
+        summary = self._summary(request)
         if not request.again:
             check_not_deconvolved(summary.content)
         if request.region is not None:
@@ -341,6 +341,11 @@ class Local(Operations):
         elif request.psf_id not in self._psfs | self._builds:
             raise _no_such_psf(request.psf_id)
         return ResolvedDeconvolve(**psf, **request.model_dump(exclude={"psf_id", "context"}))
+
+    def _summary(self, request: Deconvolve | ResolvedDeconvolve) -> HeaderSummary:
+        """The summary of the image that a request names."""
+        image = self._images[request.image_id]
+        return image.summary if request.hdu is None else read_summary(image.path, LIMITS, hdu=request.hdu)
 
     def _psf(self, identity: str, *, parts: bool) -> Psf:
         """The PSF of a file or an instrument; it is read once, because the prepared PSFs belong to this object."""
@@ -362,9 +367,7 @@ class Local(Operations):
         image, named = self._images[request.image_id], self._psfs.get(request.psf_id)
         report("reading", 0, request.method.steps)
         image.files.check()
-        summary = image.summary
-        if request.hdu is not None:
-            summary = read_summary(image.path, LIMITS, hdu=request.hdu)
+        summary = self._summary(request)
 
         def begin(stage: str, steps: int) -> Callable[[int, int], None]:
             if stage == run.DECONVOLVING:

@@ -27,6 +27,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
 from psfcore.errors import DataError, missing_extra
+from psfcore.files import fits_in
 from psfcore.noise import NoiseFigures
 from service.cli.progress import echo
 from service.cli.progress import progress_bar as progress_bar
@@ -261,7 +262,6 @@ DATA = click.option(
 )
 OVERWRITE = click.option("--overwrite", is_flag=True, help="Replace output files that exist")
 
-FITS_ENDS = (".fits", ".fits.gz", ".fts", ".fit")
 NO_KEY = "this service needs a key: set HELIOPSF_KEY to your key (the operator makes keys with `heliopsf key create`)"
 
 
@@ -360,14 +360,9 @@ def write_file(path: Path | None, write: Callable[[Path], object], *, overwrite:
 
 def fits_files(paths: Sequence[Path]) -> list[Path]:
     """The named files, each once. A folder is replaced by the FITS files in it, sorted by name."""
-    files: list[Path] = []
-    for path in paths:
-        files += (
-            sorted(one for one in path.iterdir() if one.name.lower().endswith(FITS_ENDS))
-            if path.is_dir()
-            else [path]
-        )
-    return list(dict.fromkeys(files))
+    return list(
+        dict.fromkeys(file for path in paths for file in (fits_in(path) if path.is_dir() else [path]))
+    )
 
 
 def counted(number: int, what: str) -> str:

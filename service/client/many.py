@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from psfcore.errors import DataError, HeaderError
+from psfcore.files import fits_in
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.cards import optional_text
 from psfcore.fits.header import all_hdus, first_image_header
@@ -200,7 +201,7 @@ def _products_in(folder: Path) -> _Products:
     image) to the file."""
     products: _Products = {}
     limits = FitsLimits(max_pixels=LARGEST_PX)
-    for path in sorted(folder.glob("*.fits")):
+    for path in fits_in(folder):
         try:
             all_hdus(path, limits)
             header = first_image_header(path, limits)

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from psfcore.files import probe, whole_path
+from psfcore.files import check_ending, probe, whole_path
 from service.client.errors import ServiceError
 
 Name = str | Path
@@ -63,15 +63,15 @@ def check_output_folder(folder: Name) -> None:
 def written(output: Name, *, overwrite: bool = False) -> Iterator[Path]:
     """A temporary path for the content of ``output``. The file replaces ``output`` if the block ends without an exception.
 
-    A symbolic link stays a link; the file that it leads to is replaced. A device or a pipe, such as /dev/stdout, is
-    written directly. Raises ``ServiceError`` "output-exists" if the file exists and ``overwrite`` is false.
+    A name that ends in .gz gets a file in gzip. A symbolic link stays a link; the file that it leads to is replaced. A
+    device or a pipe, such as /dev/stdout, is written directly. Raises ``ServiceError`` "output-exists" if the file exists and ``overwrite`` is false.
     """
     target = Path(output)
     if _is_device(target):
         yield target
         return
     _check_free(target, overwrite)
-    with whole_path(Path(os.path.realpath(target))) as partial:
+    with whole_path(target) as partial:
         yield partial
         _check_free(target, overwrite)  # another process may have written it during the work
 
@@ -121,6 +121,7 @@ def _check_writable(output: Path) -> None:
             raise IsADirectoryError(None, "expected a file; this is a folder")
         if not target.parent.is_dir():
             raise NotADirectoryError(None, f"there is no folder {target.parent}: make it first")
+        check_ending(output)
         probe(target)
 
 

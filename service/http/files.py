@@ -10,7 +10,8 @@ import base64
 import hashlib
 import json
 import logging
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Self
@@ -25,7 +26,7 @@ from psfcore.fits.stored_psf import check_is_psf
 from psfcore.transit.archive import START_BYTES, archive_kind, could_be_archive, list_archive
 from service.client.outputs import base_name
 from service.http.callers import Caller
-from service.http.forms import FORM, FormPart, chunks_of, media_type_of, pieces_of
+from service.http.forms import FORM, URL_ENCODED, FormPart, chunks_of, media_type_of, pieces_of
 from service.http.problems import Problem, as_problems, problem
 from service.http.quotas import Allowed
 from service.http.state import State
@@ -276,7 +277,7 @@ async def add_upload(
     if the content shows that the file cannot be used.
     """
     allowed = Allowed(state, caller)
-    with state.store.temporary() as path:
+    with state.store.temporary() as path, _advising(request):
         file = await _receive(request, path, state, kind, allowed)
         summary = await anyio.to_thread.run_sync(kind.inspect, path, state, limiter=state.inspecting)
         there = None if equal is None else await run_in_threadpool(equal, file.sha256)
@@ -289,6 +290,21 @@ async def add_upload(
     response.status_code = 201 if new else 200
     response.headers["Location"] = f"{kind.address}/{row.id}"
     return row
+
+
+@contextmanager
+def _advising(request: Request) -> Iterator[None]:
+    """Add to an error about the content of a file how to send it, if the request looks like that of `curl -d @FILE`."""
+    try:
+        yield
+    except Problem as error:
+        if error.status not in (415, 422) or media_type_of(request) != URL_ENCODED:
+            raise
+        advice = (
+            f"the body was sent as {URL_ENCODED}, as curl -d does, which removes zeros and line ends from a file: send it "
+            "with curl -F file=@FILE or curl --data-binary @FILE"
+        )
+        raise Problem(error.status, error.code, f"{error.detail}; {advice}", **error.more) from error
 
 
 async def _receive(request: Request, path: Path, state: State, kind: Kind[Any], take: Allowed) -> Received:
@@ -332,18 +348,19 @@ async def _file_of(request: Request, max_bytes: int) -> AsyncIterator[tuple[str 
         async for chunk in chunks_of(request):
             yield filename, chunk
         return
-    file: FormPart | None = None
+    files: list[FormPart] = []
     async for pieces in pieces_of(request, max_bytes + FORM_BYTES):  # the other parts of the form count too
         for part, piece in pieces:
-            if file is None and part.name == "file":
-                file = part
-            if part is file and piece:
-                yield file.filename, piece
-    if file is None:
+            if (part.name == "file" or part.filename is not None) and part not in files[-1:]:
+                files.append(part)
+            if piece and files and part is files[0]:
+                yield part.filename, piece
+    if [part.name for part in files] != ["file"]:
         raise Problem(
             400,
             "bad-form",
-            "expected a form with a part named 'file'; got none: name the part with the file 'file'",
+            f"expected a form with one file, in a part named 'file'; got {len(files)} part{'s' if len(files) != 1 else ''} "
+            "with a file: name the part 'file', and send each file in a request of its own",
         )
 
 

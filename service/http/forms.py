@@ -12,7 +12,7 @@ from starlette.requests import ClientDisconnect
 
 from service.http.problems import Problem
 
-FORM = "multipart/form-data"
+FORM, URL_ENCODED = "multipart/form-data", "application/x-www-form-urlencoded"
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from fastapi.concurrency import run_in_threadpool
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.http.forms import FORM
+from service.http.forms import FORM, URL_ENCODED
 from service.http.problems import FOR_PROGRAMS, SECURITY_HEADERS, AsPage, Problem, answer
 from service.http.state import Access
 from workers.settings import Settings
@@ -151,9 +151,7 @@ def _check_form(path: str, headers: Headers) -> None:
     if path.startswith(FOR_PROGRAMS) or UPLOADS.fullmatch(path):
         return
     if headers.get("content-type", "").lower().startswith(FORM):
-        raise Problem(
-            415, "bad-form", f"expected application/x-www-form-urlencoded; got {FORM}: send fields only"
-        )
+        raise Problem(415, "bad-form", f"expected {URL_ENCODED}; got {FORM}: send fields only")
 
 
 def _host_of(origin: str) -> str | None:

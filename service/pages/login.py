@@ -25,7 +25,7 @@ from pydantic import ValidationError
 
 from service.api.keys import KeyId, MadeKey, NewKey, list_keys, make_key, revoke_key
 from service.http.callers import BEARER, Caller, address_of, admit, cookie_name, names_its_site
-from service.http.forms import media_type_of
+from service.http.forms import URL_ENCODED, media_type_of
 from service.http.guard import SAFE_METHODS
 from service.http.paging import Cursor, Listing
 from service.http.problems import Problem
@@ -35,7 +35,6 @@ from service.pages.rendering import page
 from service.pages.sentences import of_error
 from workers.catalogue.access import LABEL_LENGTH, MEANINGS, OWNER_RULE, KeyRefused, Scope
 
-FORM = "application/x-www-form-urlencoded"
 DAY_S = 86_400
 LONGEST_ADDRESS = 2000  # characters
 ENDED = "Your login has ended. Log in again."
@@ -89,7 +88,7 @@ async def _form_token(request: Request) -> str | None:
         return None
     if cookie_name(request) not in request.cookies:
         return None
-    if media_type_of(request) != FORM:
+    if media_type_of(request) != URL_ENCODED:
         return None
     sent = (await request.form()).get("form_token")
     return sent if isinstance(sent, str) else None

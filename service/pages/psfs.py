@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any, get_args
 
@@ -13,7 +12,7 @@ from pydantic import ValidationError, validate_call
 from starlette.datastructures import FormData
 
 from psfcore.errors import DataError
-from psfcore.instruments.files import instrument_names, telescope_of
+from psfcore.instruments.files import instrument_names, parse_toml, telescope_of
 from psfcore.tables import lookup
 from service.api.images import get_psf_lineage, rerun_psf
 from service.api.pixels import picture_of
@@ -399,7 +398,7 @@ def _parameters(psf: PsfView) -> dict[str, str]:
 def _instrument(made: Mapping[str, Any]) -> dict[str, Any]:
     """The content of the instrument file from which a PSF was built; empty if there is none."""
     text = made.get("instrument_toml")
-    return tomllib.loads(text) if isinstance(text, str) else {}
+    return parse_toml(text) if isinstance(text, str) else {}
 
 
 def _flat(values: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str]]:

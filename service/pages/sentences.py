@@ -67,8 +67,8 @@ def _wrong_fields(message: str, _fields: Mapping[str, Any]) -> str:
 
 
 def _no_psf(_message: str, fields: Mapping[str, Any]) -> str:
-    why = f" heliopsf has no instrument file for it: {fields['reason']}." if fields.get("reason") else ""
-    return f"No PSF for {fields['image']} is known here.{why} Upload a PSF here, or fit one to a transit."
+    why = f": {fields['reason']}" if fields.get("reason") else ""
+    return f"No PSF for {fields['image']} is known here{why}. Upload a PSF here, or fit one to a transit."
 
 
 def _channel(_message: str, fields: Mapping[str, Any]) -> str:

@@ -18,6 +18,7 @@ from fastapi.responses import PlainTextResponse, RedirectResponse
 
 from service.api.jobs import check_own, find
 from service.http.callers import Caller, Reading, Submitting
+from service.http.forms import FORM, URL_ENCODED
 from service.http.problems import Problem, problem
 from service.http.state import Shared, State
 from service.views import time_left_s
@@ -67,7 +68,7 @@ def _form(*, files: bool = False, **described: str) -> dict[str, Any]:
     """
     fields = {name: {"type": "string", "description": text} for name, text in described.items()}
     schema = {"type": "object", "properties": fields, "additionalProperties": {"type": "string"}}
-    media_types = ["application/x-www-form-urlencoded", *(["multipart/form-data"] if files else [])]
+    media_types = [URL_ENCODED, *([FORM] if files else [])]
     content = {name: {"schema": schema} for name in media_types}
     return {**TO_JOB, "openapi_extra": {"requestBody": {"content": content}}}
 

@@ -18,7 +18,7 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import PlainTextResponse
 from fastapi.routing import APIRoute
 
-from service.http.forms import FORM, FormPart, Piece, chunks_of, media_type_of, pieces_of
+from service.http.forms import FORM, URL_ENCODED, FormPart, Piece, chunks_of, media_type_of, pieces_of
 from service.http.problems import Problem
 
 MAX_FORM_BYTES = 2**20
@@ -40,8 +40,8 @@ async def read_pairs(request: Request) -> list[tuple[str, str]]:
         sent = await multipart_pairs(request, MAX_FORM_BYTES)
     else:
         body = b"".join([chunk async for chunk in chunks_of(request)])  # service.http.guard bounds its size
-        if body and media_type not in ("", "application/x-www-form-urlencoded"):
-            raise bad(f"expected application/x-www-form-urlencoded, got {media_type}", 415)
+        if body and media_type not in ("", URL_ENCODED):
+            raise bad(f"expected {URL_ENCODED}, got {media_type}", 415)
         try:
             sent = parse_qsl(
                 body.decode(), keep_blank_values=True, errors="strict", max_num_fields=MAX_FIELDS

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import copy
+import gzip
 import json
+import pickle
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -95,6 +98,31 @@ def test_an_image_is_deconvolved_as_the_core_does(tmp_path: Path) -> None:
     core = method_named("richardson-lucy")(image, psf, Conditions(), steps=3)
     np.testing.assert_array_equal(result.pixels, core.pixels)
     assert steps[-1] == (3, 3) and result.steps_done == 3
+
+
+@pytest.mark.filterwarnings("ignore::psfcore.errors.DataWarning")
+def test_a_result_is_copied_and_goes_to_another_process(psf: heliopsf.Psf) -> None:
+    pixels = 100 + 50 * np.random.default_rng(1).random((64, 80))
+    cases: tuple[dict[str, Any], ...] = (
+        {},
+        {"noise": (5.0, 2.0), "error_draws": 2},
+        {"region": np.s_[10:40, 20:60]},
+    )
+    for asked in cases:
+        result = heliopsf.deconvolve(pixels, psf, steps=2, full=True, **asked)
+        for again in (pickle.loads(pickle.dumps(result)), copy.deepcopy(result)):
+            for name in ("pixels", "quality", "error"):
+                np.testing.assert_array_equal(getattr(again, name), getattr(result, name))
+            assert again.changes == result.changes and again.lines() == result.lines(), asked
+
+
+def test_a_psf_is_written_as_its_name_says(psf: heliopsf.Psf, tmp_path: Path) -> None:
+    psf.write(tmp_path / "psf.fits")
+    psf.write(tmp_path / "psf.fits.gz")
+    assert gzip.decompress((tmp_path / "psf.fits.gz").read_bytes()) == (tmp_path / "psf.fits").read_bytes()
+    np.testing.assert_array_equal(heliopsf.read_psf(tmp_path / "psf.fits.gz").kernel, psf.kernel)
+    with pytest.raises(OSError, match=r"\.fits\.gz"):
+        psf.write(tmp_path / "psf.fits.fz")
 
 
 def test_errors_have_a_code_and_what_is_not_sure_is_a_warning(

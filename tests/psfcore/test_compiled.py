@@ -66,7 +66,8 @@ def test_a_kernel_that_cannot_be_written_is_used(tmp_path: Path, caplog: pytest.
 
     files._open_for_write = full
     files.save(("float32",), "code")
-    assert "cannot write a compiled kernel" in caplog.text
+    files.save(("float64",), "code")
+    assert "No space left" in caplog.text and len(caplog.records) == 1, "a folder is named once"
 
 
 def test_kernels_that_others_can_write_or_rename_are_not_used(
@@ -80,6 +81,7 @@ def test_kernels_that_others_can_write_or_rename_are_not_used(
         assert files.load(("float32",)) is None
         files.save(("float64",), "code")
         assert len(list(tmp_path.iterdir())) == 1 and "nobody else can write" in caplog.text
+    assert len(caplog.records) == 1, "a folder is named once"
     tmp_path.chmod(0o700)
     (kept,) = tmp_path.iterdir()
     kept.chmod(0o666)
@@ -94,15 +96,18 @@ def test_kernels_that_others_can_write_or_rename_are_not_used(
     assert files.load(("float32",)) == "code"
 
 
-def test_the_kernels_are_kept_in_a_private_folder_where_the_usual_one_is_open(tmp_path: Path) -> None:
+def test_the_kernels_are_kept_in_a_private_folder_where_the_usual_one_is_open(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HELIOPSF_CACHE_DIR", str(tmp_path / "cache"))
     usual = tmp_path / "usual"
     usual.mkdir()
-    assert kernel_folder(usual, tmp_path) == str(usual)
+    assert kernel_folder(usual) == str(usual)
     kernel_folder.cache_clear()
     usual.chmod(0o777)
-    private = Path(kernel_folder(usual, tmp_path))
+    private = Path(kernel_folder(usual))
     kernel_folder.cache_clear()
-    assert private.is_relative_to(tmp_path / ".cache") and private.stat().st_mode & 0o777 == 0o700
+    assert private.is_relative_to(tmp_path / "cache") and private.stat().st_mode & 0o777 == 0o700
     files = KernelFiles(str(private), "f.py311", "source")
     files.save(("float32",), "code")
     assert files.load(("float32",)) == "code"
@@ -231,6 +236,39 @@ def test_a_kernel_that_is_called_by_its_address_is_kept_and_loaded(tmp_path: Pat
     assert said == [["0", "0", "0", "0", "True"], ["1", "1", "1", "1", "False"]]
     assert list(tmp_path.rglob("*forward_8*")), "the passes are kept here"
     assert not list(tmp_path.rglob("*forward_4*")), "a plan compiles only the passes that it needs"
+
+
+@pytest.mark.parametrize("place", ["cache", "/proc/nowhere"])
+def test_where_numba_finds_no_folder_kernels_are_kept_in_the_cache_or_not_at_all(
+    tmp_path: Path, place: str
+) -> None:
+    """As in a container whose user owns neither the installation nor a home."""
+    (tmp_path / "kernels.py").write_text(MODULE)
+    script = (
+        "import kernels, psfcore.compiled as c; kernels.run(kernels.add_20); kernels.run(kernels.add_1); "
+        "print(c.folder_of_kernels()[1])"
+    )
+    done = [
+        subprocess.run(
+            [sys.executable, "-c", script],
+            check=True,
+            cwd=tmp_path,
+            env={
+                "NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator",  # numba's folder that no variable names
+                "HELIOPSF_CACHE_DIR": str(tmp_path / place),
+                "PYTHONPATH": str(ROOT),
+            },
+            capture_output=True,
+            text=True,
+        )
+        for _ in range(2)
+    ]
+    kept = place == "cache"
+    for number, one in enumerate(done):
+        hits = str(number if kept else 0)
+        assert one.stdout.split() == [*["20.0"] * 3, hits, *["1.0"] * 3, hits, str(kept)], one.stderr
+        told = [line for line in one.stderr.splitlines() if "NUMBA_CACHE_DIR" in line]
+        assert len(told) == (0 if kept else 1), "it is said once"
 
 
 def test_a_function_that_uses_constants_needs_a_name() -> None:

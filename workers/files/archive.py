@@ -26,7 +26,7 @@ from pathlib import Path, PurePath
 from typing import Any, BinaryIO
 
 from psfcore.errors import DataError
-from psfcore.files import PARTIAL
+from psfcore.files import FITS_ENDING, PARTIAL
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.cards import optional_value
 from psfcore.fits.header import first_image_header
@@ -35,7 +35,6 @@ from workers.files.modes import open_file, open_folder, open_made_folder
 
 ANY_FOLDERS = "**"
 _MAGIC = re.compile(r"[*?\[]")
-_FITS_ENDING = re.compile(r"\.(fits|fit|fts)(\.gz)?$", re.IGNORECASE)
 _NOT_IN_A_NAME = re.compile(r"[^A-Za-z0-9._-]+")
 _CHUNK = 2**20
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
@@ -141,7 +140,7 @@ def safe_name(name: str, identity: str) -> str:
 
 def stem_of(name: str) -> str:
     """The name of a file without its ending, made of letters, digits, full stops, underscores and hyphens."""
-    return _NOT_IN_A_NAME.sub("_", _FITS_ENDING.sub("", PurePath(name).name)).strip("._-")[:80] or "image"
+    return _NOT_IN_A_NAME.sub("_", FITS_ENDING.sub("", PurePath(name).name)).strip("._-")[:80] or "image"
 
 
 def shown(path: PurePath) -> str:

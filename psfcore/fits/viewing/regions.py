@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits, first_image
+from psfcore.fits.cards import number_of
 from psfcore.fits.hdus import readable_pixels
 from psfcore.fits.header import all_hdus, shape_of
 from psfcore.limited import run_limited
@@ -150,8 +151,8 @@ def moved_header(whole: fits.Header, columns: slice, rows: slice) -> fits.Header
         header.remove(key, ignore_missing=True, remove_all=True)
     for card in list(header.cards):
         moved = _MOVED.fullmatch(card.keyword)
-        if moved is not None and isinstance(card.value, (int, float)):
-            header[card.keyword] = card.value - (columns if moved[1] == "1" else rows).start
+        if moved is not None and (at := number_of(card.value)) is not None:
+            header[card.keyword] = at - (columns if moved[1] == "1" else rows).start
     return header
 
 

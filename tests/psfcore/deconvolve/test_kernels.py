@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -44,6 +45,17 @@ def started(monkeypatch: pytest.MonkeyPatch) -> list[_Process]:
 def test_no_process_is_started_after_a_small_deconvolution(started: list[_Process]) -> None:
     """It leaves the kernels on disk."""
     kernels.compile_kernels("linear", (64, 96))
+    with kernels.compiling_beside("linear", (64, 96)):
+        pass
+    assert started == []
+
+
+def test_no_process_is_started_where_kernels_cannot_be_kept(
+    started: list[_Process], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """This process would have to compile them again."""
+    monkeypatch.setattr(kernels, "is_kept", lambda kernel: False)
+    monkeypatch.setattr(kernels, "folder_of_kernels", lambda: (tmp_path, False))
     with kernels.compiling_beside("linear", (64, 96)):
         pass
     assert started == []

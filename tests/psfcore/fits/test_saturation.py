@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from scipy.stats import poisson
 
 from psfcore.fits import observation
-from psfcore.fits.observation import largest_value, read_observation, with_saturation
+from psfcore.fits.observation import read_observation
+from psfcore.fits.saturation import largest_value, with_saturation
 from psfcore.image import Image, MaskBit
 from psfcore.instruments.model import Instrument, parse_instrument
 from tests.conftest import SMALL_INSTRUMENT, write_image
@@ -135,7 +136,7 @@ def test_the_chance_is_the_poisson_probability() -> None:
 
 LEVELS = [
     ({"SATURATE": 4000.0}, "DN", {}, 4000.0, "SATURATE"),
-    ({"DSATVAL": 3000.0, "SATURATE": 4000.0, "DATASAT": 5}, "DN", {}, 3000.0, "DSATVAL"),
+    ({"DSATVAL": 3000.0, "SATURATE": 4000.0, "DATASAT": 200}, "DN", {}, 3000.0, "DSATVAL"),
     ({"SAT_THR": 3000.0}, "DN/s", {}, 3000.0, "SAT_THR"),
     ({}, "DN/s", {"instrument_dn": 4000.0}, 2000.0, "instrument file"),
     ({}, "DN / s", {"requested_dn": 4000.0, "instrument_dn": 100.0}, 2000.0, "request"),

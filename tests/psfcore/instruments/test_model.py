@@ -39,6 +39,7 @@ def test_values_are_converted_to_their_types() -> None:
     assert instrument.match == {"DETECTOR": "D", "CDELT1": 2.0} and type(instrument.match["CDELT1"]) is float
     assert list(instrument.detector.gain_modes) == ["HIGH"]
     assert read().match == {} and read().mount is None and read().detector.gain_modes == {}
+    assert parse_instrument("\ufeff" + SMALL_INSTRUMENT.replace("\n", "\r\n"), "of Windows") == read()
 
 
 FAULTS = [

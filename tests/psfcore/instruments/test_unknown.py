@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from astropy.io.fits import Header
+import numpy as np
+from astropy.io.fits import Header, PrimaryHDU
 
 from psfcore.errors import DataError
-from psfcore.fits.header import seen_by
+from psfcore.fits.blocks import LIMITS
+from psfcore.fits.header import read_summary, seen_by
 from psfcore.instruments.unknown import TELESCOPES, WAYS, telescope_without_file, unknown_instrument
 
 SUVI = "GOES-R Series Solar Ultraviolet Imager"
@@ -63,7 +66,26 @@ def test_the_error_names_the_telescope_the_reason_and_the_step() -> None:
         seen = seen_by(Header(cards))
         assert telescope_without_file(seen) is None, cards
         error = unknown_instrument(seen)
-        assert error.fields["reason"] is None and error.fields["ways"] == list(WAYS)
+        assert (error.fields["reason"] is None) is bool(cards) and error.fields["ways"] == list(WAYS)
+
+
+def test_the_error_names_the_cards_that_the_header_lacks(tmp_path: Path) -> None:
+    aia = {"TELESCOP": "SDO/AIA", "INSTRUME": "AIA_3"}
+    for cards, named in (
+        ({"BUNIT": "DN"}, ("TELESCOP", "INSTRUME")),
+        (aia, ("WAVELNTH", "WAVEUNIT")),
+        (aia | {"WAVELNTH": "EUV"}, ("WAVELNTH = 'EUV'",)),
+        (aia | {"WAVELNTH": 171, "WAVEUNIT": "furlong"}, ("WAVELNTH = 171", "WAVEUNIT = 'furlong'")),
+    ):
+        path = tmp_path / "image.fits"
+        PrimaryHDU(np.ones((8, 8), np.float32), Header(cards)).writeto(path, overwrite=True)
+        summary = read_summary(path, LIMITS)
+        assert summary.instrument is None, cards
+        for seen in (asdict(summary), seen_by(Header(cards))):
+            error = unknown_instrument(seen)
+            told = error.fields["reason"]
+            assert told[1:] in error.message and all(one in told for one in named if "=" not in one), cards
+            assert "cards" not in seen or all(one in told for one in named), (cards, told)
 
 
 def test_the_documentation_lists_every_telescope() -> None:

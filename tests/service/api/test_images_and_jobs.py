@@ -79,6 +79,34 @@ def test_the_file_of_an_upload_is_what_was_sent(api: TestClient, image_file: Pat
     assert part.status_code == 206 and part.content == b"SIMPLE  ="
 
 
+def test_a_form_with_several_files_is_refused_and_none_is_kept(api: TestClient, image_file: Path) -> None:
+    content = image_file.read_bytes()
+    for parts, count in (
+        ([("file", ("a.fits", content)), ("file", ("a.fits", content))], 2),
+        ([("file", ("a.fits", content)), ("other", ("b.fits", content))], 2),
+        ([("image", ("a.fits", content))], 1),
+        ([("file", ("a.fits", content)), ("file", ("b.fits", b"x")), ("file", ("c.fits", b""))], 3),
+    ):
+        told = refusal(api.post("/v1/images", files=parts), 400, "bad-form")
+        assert f"got {count} part" in told, told
+    assert api.get("/v1/images").json()["items"] == []
+
+
+def test_a_file_sent_as_curl_d_does_gets_the_right_option(api: TestClient, image_file: Path) -> None:
+    content = image_file.read_bytes()
+    headers = {"Content-Type": "application/x-www-form-urlencoded"}
+    stripped = content.translate(None, b"\0\r\n")
+    for body, status, code in (
+        (stripped, 422, "truncated-data"),
+        (gzip.compress(content).translate(None, b"\0\r\n"), 422, "bad-gzip"),
+        (b"file=@image.fits", 415, "not-fits"),
+    ):
+        told = refusal(api.post("/v1/images", content=body, headers=headers), status, code)
+        assert "-F file=@" in told and "--data-binary @" in told
+    assert "curl" not in refusal(api.post("/v1/images", content=stripped), 422, "truncated-data")
+    assert api.post("/v1/images", content=content, headers=headers).status_code == 201, "--data-binary"
+
+
 def test_an_image_of_a_known_instrument_needs_no_psf_id(api: TestClient, tmp_path: Path) -> None:
     write_image(tmp_path / "hri.fits", DETECTOR="HRI_EUV", TELESCOP="SOLO/EUI/HRI_EUV")
     image_id = upload(api, tmp_path / "hri.fits")

@@ -71,15 +71,18 @@ def test_with_nothing_there_it_says_so_and_makes_nothing(tmp_path: Path) -> None
     assert list(tmp_path.iterdir()) == []
 
 
-def test_all_is_well_where_a_worker_is_there(catalogue: Catalogue) -> None:
+def test_all_is_well_where_a_worker_is_there(catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
     catalogue.census.announce("host:1", time.time(), software_version())
     assert set(states()) == {
-        "versions", "threads", "storage", "broker", "database", "schema", "clock", "workers", "stuck jobs",
+        "versions", "threads", "kernels", "storage", "broker", "database", "schema", "clock", "workers", "stuck jobs",
     }  # fmt: skip
     found = findings()
-    for what in ("storage", "broker", "database", "schema", "clock", "workers", "stuck jobs"):
+    for what in ("kernels", "storage", "broker", "database", "schema", "clock", "workers", "stuck jobs"):
         assert found[what]["state"] == "ok", found[what]
     assert "host:1" in found["workers"]["found"]
+    monkeypatch.setattr(cli_doctor, "folder_of_kernels", lambda: (Path("/nowhere"), False))
+    told = findings()["kernels"]
+    assert told["state"] == "warning" and "/nowhere" in told["found"] and "NUMBA_CACHE_DIR" in told["advice"]
 
 
 def test_a_broken_url_is_a_plain_sentence_without_its_password(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -86,6 +86,13 @@ def test_an_image_without_a_known_psf_prints_the_ways_on(tmp_path: Path, image_f
     assert f"--psf ID, such as {12 * 'a'} (p 1)" in lines[2] and "--local" not in caught.value.message
 
 
+def test_a_folder_stands_for_its_fits_files(tmp_path: Path) -> None:
+    for name in ("b.fits.fz", "a.fts.gz", "._a.fits", "notes.txt"):
+        (tmp_path / name).touch()
+    first, second, notes = (tmp_path / name for name in ("a.fts.gz", "b.fits.fz", "notes.txt"))
+    assert cli_options.fits_files([notes, second, tmp_path]) == [notes, second, first]
+
+
 def test_warnings_of_a_product_are_printed(tmp_path: Path) -> None:
     write_image(tmp_path / "i.fits", WAVELNTH=193)
     write_psf(tmp_path / "p.fits")

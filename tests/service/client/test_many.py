@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -113,8 +114,12 @@ def test_a_product_is_known_by_its_header_and_not_by_its_name(
     renamed = made.output.rename(tmp_path / "out" / "renamed.fits")
     (known,) = run(images[0])
     assert known.existed and known.output == renamed
-    shutil.copy(images[1], made.output)  # an image under the name of the product
+    packed = tmp_path / "out" / "packed.fits.gz"
+    packed.write_bytes(gzip.compress(renamed.read_bytes()))
     renamed.unlink()
+    assert run(images[0])[0].output == packed
+    shutil.copy(images[1], made.output)  # an image under the name of the product
+    packed.unlink()
     (refused,) = run(images[0])
     assert refused.failure is not None and "the file exists" in refused.failure
     assert made.output.read_bytes() == images[1].read_bytes()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import os
 from pathlib import Path
 
@@ -71,6 +72,9 @@ def test_a_link_stays_a_link_and_a_device_is_not_replaced(tmp_path: Path) -> Non
     with written(tmp_path / "link") as partial:
         partial.write_text("content")
     assert (tmp_path / "link").is_symlink() and (tmp_path / "target").read_text() == "content"
+    with written(tmp_path / "content.gz") as partial:
+        partial.write_text("content")
+    assert gzip.decompress((tmp_path / "content.gz").read_bytes()) == b"content"
     with written(os.devnull) as partial:
         assert partial == Path(os.devnull)
     assert Path(os.devnull).is_char_device()
@@ -78,7 +82,8 @@ def test_a_link_stays_a_link_and_a_device_is_not_replaced(tmp_path: Path) -> Non
 
 def test_what_cannot_be_written_is_noticed_by_trying(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").touch()
-    for place in (tmp_path / "no" / "x", tmp_path / "file" / "x", tmp_path, Path("/proc/x")):
+    packed = tmp_path / "x.fits.fz"
+    for place in (tmp_path / "no" / "x", tmp_path / "file" / "x", tmp_path, Path("/proc/x"), packed):
         assert code(place, overwrite=True) == "output-not-writable", place
     for folder in (tmp_path / "file", Path("/proc/x")):
         with pytest.raises(ServiceError) as caught:

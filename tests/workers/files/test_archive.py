@@ -223,6 +223,8 @@ def test_headers_that_meet_conditions(tmp_path: Path) -> None:
 def test_names_of_products() -> None:
     for name, safe in (
         ("solo_L2_eui-hrieuv174.fits.gz", "solo_L2_eui-hrieuv174"),
+        ("a.fits.fz", "a"),
+        ("b.FTS.GZ", "b"),
         ("../../etc/passwd", "passwd"),
         ("a b;rm -rf $HOME.FITS", "a_b_rm_-rf_HOME"),
         (".hidden.fits", "hidden"),
