@@ -113,7 +113,7 @@ FAULTS = (
     Fault("gap-closure-keeps-noise", "psfcore/gap/verdict/closure.py",
           'value = 1 - float((chi2_after - nu).sum()) / total', 'value = 1 - float(chi2_after.sum()) / total'),
     Fault("gap-prior-of-each-form-undivided", "psfcore/gap/verdict/answer.py",
-          'else 0.5) / len(alike) / len(families)', 'else 0.5) / len(families)'),
+          '0.5 / alike[form.family, form.field is None] / len(families)', '0.5 / len(families)'),
     Fault("blind-half-of-a-pair-counts", "psfcore/blind/judged.py",
           'if all(self.matches(one, level)', 'if any(self.matches(one, level)'),
     Fault("built-damaged-psf-used", "psfcore/psf_cache.py",

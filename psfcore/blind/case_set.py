@@ -29,16 +29,13 @@ from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from psfcore.arrays import array_sha256
 from psfcore.blind.cases import DRAW, SetPlan, draw_case
+from psfcore.blind.effects.effect import Plane
 from psfcore.blind.make_case import make
 from psfcore.errors import DataError
 from psfcore.files import write_whole
 
-Plane = NDArray[np.float64]
 Progress = Callable[[str], None]
 
 LOCK = "lock"  # the file by which a run locks the folder of its set
@@ -105,8 +102,7 @@ class BlindSet:
     def keep_truth(self, number: int, truth: dict[str, Any]) -> str:
         """Write the truth of a case with a random salt. Returns its seal."""
         salt = secrets.token_hex(16)
-        kept = json.dumps({"salt": salt, "truth": truth}, allow_nan=False)
-        write_whole(self.truth_file(number), kept)
+        write_whole(self.truth_file(number), json.dumps({"salt": salt, "truth": truth}, allow_nan=False))
         return _seal_of(salt, truth)
 
     def keep_seal(self, number: int, seal: str) -> None:
@@ -222,12 +218,10 @@ def _end_with_parent() -> None:
 def _remember(made: BlindSet, plan: SetPlan, scenes: Sequence[Plane]) -> None:
     """Write the plan of the set; if the folder contains a set, check that it has the same plan."""
     own = {"scenes": [array_sha256(scene) for scene in scenes], "draw": DRAW}
-    about = json.loads(json.dumps(asdict(plan) | own))
-    file = made.folder / "set.json"
+    about, file = json.loads(json.dumps(asdict(plan) | own)), made.folder / "set.json"
     if file.is_file():
         before = json.loads(file.read_text("utf-8"))
-        same = {key: value for key, value in before.items() if key != "cases"}
-        if same != {key: value for key, value in about.items() if key != "cases"}:
+        if before | {"cases": plan.cases} != about:
             raise DataError(
                 "other-set",
                 f"expected an empty folder, or a set that was made with {about}; {made.folder} contains a set that "

@@ -27,10 +27,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from psfcore.blind.effects.effect import TEST, Effect
+from psfcore.blind.effects.effect import TEST, Effect, Plane
 from psfcore.blind.effects.fine_optics import FINE, INSTRUMENT, SYNTHETIC, Glass
 from psfcore.blind.effects.registry import KNOWN, WITHHELD, effect_named
 from psfcore.blind.effects.scene import patches
@@ -40,7 +39,6 @@ from psfcore.simulate.plan import WEST, Plan, Shot, default_plan
 from psfcore.simulate.scatter_truth import ScatterTruth
 from psfcore.simulate.scene import drawn_scene, scene_from_image
 
-Plane = NDArray[np.float64]
 Range = tuple[float, float]
 CLEAN, SINGLE, PAIR, FOREIGN, MIXED = "clean", "single", "pair", "unknown", "mixed"
 DRAW = 4  # raise it when the same seed and number give another case
@@ -115,7 +113,15 @@ def draw_case(of: SetPlan, number: int) -> Case:
     rng = np.random.default_rng([of.seed, number, _TRUTH_STREAM])
     plan = _plan(of.size_px, of.images, rng)
     law = ScatterTruth(rng.uniform(3, 9), rng.uniform(2.3, 2.8), rng.uniform(0.25, 0.5))
-    glass = _glass(of.size_px, rng, of.built_diffraction)
+    glass = Glass(
+        INSTRUMENT if of.built_diffraction and rng.random() < _BUILT_SHARE else SYNTHETIC,
+        of.size_px,
+        core_px=float(rng.uniform(0.08, 0.2)),
+        wing_px=float(rng.uniform(1.0, 3.0)),
+        wing_share=float(rng.uniform(0.05, 0.15)),
+        arm_share=float(rng.uniform(0.05, 0.2)),
+        pitch_px=float(rng.uniform(5.0, 6.5)),
+    )
     headroom = float(rng.uniform(1.2, 2.0)) if rng.random() < _SATURATING_SHARE else None
     own = np.random.default_rng([of.seed, number, _EFFECT_STREAM])
     turn = number // max(len(of.only), 1)
@@ -142,9 +148,8 @@ def _content(of: SetPlan, number: int) -> tuple[str, list[tuple[str, Range]]]:
         return (SINGLE if name in KNOWN else FOREIGN), [(name, USUAL_PCT)]
     block, place = divmod(number, len(_BLOCK))
     order = np.random.default_rng([of.seed, block, _KIND_STREAM]).permutation(len(_BLOCK))
-    kinds = [_BLOCK[n] for n in order]
-    kind = kinds[place]
-    count = block * _BLOCK.count(kind) + kinds[:place].count(kind)  # number of earlier cases of this kind
+    *before, kind = [_BLOCK[n] for n in order[: place + 1]]
+    count = block * _BLOCK.count(kind) + before.count(kind)  # number of earlier cases of this kind
     withheld = WITHHELD[of.withheld]
     if kind == SINGLE:
         strong = count % _STRONG_SINGLES == _STRONG_SINGLES - 1
@@ -204,19 +209,6 @@ def _plan(size_px: int, images: int, rng: np.random.Generator) -> Plan:
     return dataclasses.replace(plan, shots=tuple(map(moved, plan.shots)))
 
 
-def _glass(size_px: int, rng: np.random.Generator, built: bool) -> Glass:
-    kind = INSTRUMENT if built and rng.random() < _BUILT_SHARE else SYNTHETIC
-    return Glass(
-        kind,
-        size_px,
-        core_px=float(rng.uniform(0.08, 0.2)),
-        wing_px=float(rng.uniform(1.0, 3.0)),
-        wing_share=float(rng.uniform(0.05, 0.15)),
-        arm_share=float(rng.uniform(0.05, 0.2)),
-        pitch_px=float(rng.uniform(5.0, 6.5)),
-    )
-
-
 def case_scenes(case: Case, images: Sequence[Plane] = ()) -> dict[int, Plane]:
     """Fine scenes [y, x], DN/s, by pointing: cut from images, or synthetic with random statistics if there are no
     images.
@@ -231,8 +223,7 @@ def case_scenes(case: Case, images: Sequence[Plane] = ()) -> dict[int, Plane]:
             scene = scene_from_image(given[:, ::-1] if mirrored else given, case.plan)
             scene = np.asarray(gaussian_filter(scene, 0.5 * FINE))  # it is cut from an image with noise
         else:
-            drawn = drawn_scene(case.plan, pointing, case.seed)
-            scene = _with_own_statistics(drawn, case, pointing)
+            scene = _with_own_statistics(drawn_scene(case.plan, pointing, case.seed), case, pointing)
         if scene.max() <= 0:
             raise DataError(
                 "bad-scene",
@@ -247,12 +238,10 @@ def _with_own_statistics(scene: Plane, case: Case, pointing: int) -> Plane:
     """Add to a synthetic scene: broad and fine modulation, compact brightenings with power-law brightness, and a
     constant."""
     rng = np.random.default_rng([case.seed, pointing, 4])
-    n = scene.shape[0]
-    seed = int(rng.integers(2**31))
+    n, seed = scene.shape[0], int(rng.integers(2**31))
     broad, fine = patches(n, seed, float(rng.uniform(0.1, 0.4))), patches(n, seed + 1, 0.015)
     lit = scene * np.exp(rng.uniform(0.1, 0.5) * broad + rng.uniform(0.0, 0.35) * fine)
-    points = np.zeros_like(lit)
-    count = int(rng.integers(5, 60))
+    points, count = np.zeros_like(lit), int(rng.integers(5, 60))
     rows, columns = rng.integers(0, n, (2, count))
     light = rng.pareto(1.7, count) * rng.uniform(0.3, 1.5) * lit[rows, columns]
     np.add.at(points, (rows, columns), np.minimum(light, 40 * lit.mean()))

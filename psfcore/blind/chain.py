@@ -16,13 +16,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.blind.effects.effect import Earlier, Effect, Moment, apply_effects
+from psfcore.blind.effects.effect import Earlier, Effect, Moment, Plane, apply_effects
 from psfcore.blind.effects.fine_optics import FINE, FineOptics
 from psfcore.simulate.plan import HIGH, Plan
 from psfcore.simulate.sky import behind, binned, covered_share
 from psfcore.transit.transit import Place
 
-Plane = NDArray[np.float64]
 _SKY_STEPS = ("scene", "covered", "foreground", "optics", "spread")
 _MOST_MOTION_PX = 5.0  # largest distance of a moving disc from its position in the middle of the exposure
 _REALISATIONS_STREAM, _NOISE_STREAM = 2001, 2002
@@ -66,9 +65,8 @@ class Chain:
     def rates(self) -> list[Plane]:
         """The expected light of every image on detector pixels [y, x], DN/s, before the readout. It contains no
         noise."""
-        changes_sky = any(effect.strength and effect.kind.step in _SKY_STEPS for effect in self.effects)
         lights: Iterable[NDArray[np.floating]] = self.clean.lights
-        if changes_sky:
+        if any(effect.strength and effect.kind.step in _SKY_STEPS for effect in self.effects):
             lights = focal_planes(self.clean, self.effects)
         rates = []
         for index, plane in enumerate(lights):
@@ -145,8 +143,7 @@ def focal_planes(clean: EffectFree, effects: Sequence[Effect]) -> Iterator[Plane
 def lit_scene(clean: EffectFree, effects: Sequence[Effect], moment: Moment) -> Plane:
     """The fine scene of an image, with its occulter in front [y, x], DN/s."""
     scene = apply_effects(effects, "scene", clean.scenes[moment.shot.pointing], moment)
-    lit = scene.copy()
-    place = clean.plan.place(moment.index)
+    lit, place = scene.copy(), clean.plan.place(moment.index)
     # The patch must contain a moving disc.
     wide = Place(place.x_px, place.y_px, place.radius_px + _MOST_MOTION_PX)
     around = behind(scene, wide, fine=FINE, margin_px=0)

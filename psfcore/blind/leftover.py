@@ -21,15 +21,13 @@ from numpy.typing import NDArray
 from psfcore.noise import Noise
 from psfcore.scatter.inversion import invert
 from psfcore.scatter.reconstruction import DARK_MARGIN_PX, Reconstruction, TransitScenes
-from psfcore.scatter.shapes import SOFTENED_POWER_LAW
+from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Kernel, Vector
 from psfcore.scatter.total_psf import Blur, Optics, TotalPsf
 from psfcore.simulate.scatter_truth import ScatterTruth
 from psfcore.transit.occulter import fully_dark
 from psfcore.transit.transit import Frame, Transit
 
 Plane = NDArray[np.floating]
-Kernel = NDArray[np.float64]
-Vector = NDArray[np.float64]
 _WARM_STEPS = 3
 
 

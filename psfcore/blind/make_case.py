@@ -19,7 +19,7 @@ from scipy.ndimage import map_coordinates, uniform_filter
 
 from psfcore.blind.cases import Case, case_scenes
 from psfcore.blind.chain import Chain, EffectFree
-from psfcore.blind.effects.effect import Effect
+from psfcore.blind.effects.effect import Effect, Plane
 from psfcore.blind.effects.fine_optics import binned_glass, fine_optics
 from psfcore.blind.leftover import LinearEstimator, refitted, rms
 from psfcore.simulate.plan import HIGH
@@ -27,7 +27,6 @@ from psfcore.simulate.transit import reported_places, write_observation
 from psfcore.transit.prepare import Exposure, prepare
 from psfcore.transit.transit import Frame
 
-Plane = NDArray[np.float64]
 WITHOUT_EFFECTS, CAUSES_FILE = "without_effects", "causes.json"
 TRIALS = 2
 STRENGTH_WITHIN = 1.4  # a strength is accepted if its residual is within this factor of the target

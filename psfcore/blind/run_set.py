@@ -17,13 +17,13 @@ import subprocess
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from psfcore.blind.case_set import BlindSet
+from psfcore.blind.case_set import BlindSet, Progress
 from psfcore.errors import DataError
 from psfcore.files import write_whole
 
@@ -33,8 +33,6 @@ _KEYS = {REPORT_SCHEMA: {"verdict", "causes"}, BOUND_SCHEMA: {"causes"}}
 LONGEST_S = 1800.0
 _KIB = 1024
 _LAST_WORDS = 2000
-
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)

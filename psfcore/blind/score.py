@@ -90,16 +90,14 @@ def row(
     """A row of the table, as JSON. least, most: the goal. interval: Eq. (1), if the value is a fraction of cases."""
     bounds = [f"{bound:.3g}" for bound in (least, most) if bound is not None]
     sign = "" if len(bounds) != 1 else "<= " if least is None else ">= "
-    met = None
-    if value is not None and bounds:
-        met = (least is None or value >= least) and (most is None or value <= most)
+    within = value is not None and (least is None or value >= least) and (most is None or value <= most)
     return {
         "figure": figure,
         "n": cases,
         "value": value,
         "wilson95": None if interval is None else list(interval),
         "goal": sign + " - ".join(bounds),
-        "met": met,
+        "met": within if bounds and value is not None else None,
     }
 
 
@@ -234,8 +232,11 @@ def _levels(causes: Sequence[Cause]) -> dict[str, Any]:
     told: dict[str, Any] = {"n": len(causes)}
     for level in LEVELS:
         right, bounds = sum(_right(causes, level)), _bounds(causes, level)
-        interval = list(wilson(right, len(causes)))
-        told[level] = {"right": right, "wilson95": interval, "bound": mean(bounds) if bounds else None}
+        told[level] = {
+            "right": right,
+            "wilson95": list(wilson(right, len(causes))),
+            "bound": mean(bounds) if bounds else None,
+        }
     return told
 
 
@@ -303,8 +304,8 @@ def table(found: Mapping[str, Any]) -> str:
         )
         lines.append(f"{one['class']:<50}{one['n']:>5}" + "".join(f"{text:>16}" for text in shares))
     lines.append(f"{found['judged']} cases judged, {len(found['failures'])} failed")
-    failures = found["failures"].items()
-    return "\n".join([*lines, *(f"  {number}: {why.splitlines()[-1]:.120}" for number, why in failures)])
+    lines += [f"  {number}: {why.splitlines()[-1]:.120}" for number, why in found["failures"].items()]
+    return "\n".join(lines)
 
 
 def judged_cases(made: BlindSet, numbers: Sequence[int]) -> tuple[list[Judged], dict[int, str]]:
@@ -395,11 +396,9 @@ def _draw_power(axes: Axes, power: list[dict[str, Any]]) -> None:
         errors = np.abs(ends - shares)
         axes.errorbar(ats + shift, shares, yerr=errors, fmt="o", color=colour, capsize=3, label=level)
         axes.plot(ats + shift, [one[level]["bound"] for _, one in bins], "--", color=colour)
-    edges = (one["noncentrality"] for one in power)
-    labels = [f"{low:g} -\n{'' if high is None else f'{high:g}'}" for low, high in edges]
-    axes.set_xticks(
-        range(len(labels)), [f"{label}\nn = {one['n']}" for label, one in zip(labels, power, strict=True)]
-    )
+    edges = ((*one["noncentrality"], one["n"]) for one in power)
+    labels = [f"{low:g} -\n{'' if high is None else f'{high:g}'}\nn = {n}" for low, high, n in edges]
+    axes.set_xticks(range(len(labels)), labels)
     axes.set(
         xlabel="noncentrality of the cause",
         ylabel="share of causes for which the answer is right (dashed: the bound)",

@@ -31,7 +31,7 @@ from psfcore.errors import DataError
 from psfcore.files import write_whole
 from psfcore.fits.blocks import LIMITS
 from psfcore.gap.effect import Change, Effect, EffectParameter
-from psfcore.gap.evidence.closed_form import ClosedForm, Form
+from psfcore.gap.evidence.closed_form import ClosedForm
 from psfcore.gap.evidence.columns import FieldColumns
 from psfcore.gap.evidence.evidence import gather
 from psfcore.gap.evidence.linear_model import LinearModel
@@ -114,22 +114,19 @@ def _bound(
     bright = blocks.gain_width * rng.standard_normal((len(blocks.levels), 1, DRAWS))
     levels = blocks.errors[column][..., None] + noise + blocks.means[..., None] * bright
     closed = ClosedForm(model, columns, draws=(discs, levels))
-    forms = [
-        _as_known(form, own[number], cause)
-        for form in closed.forms
-        if form.effect not in own or form.effect == own[number]
-    ]
-    # The observer knows the true form, so the form of the library is no rival.
+    # The observer knows the true form: it has the name of the library and one scale, at which its strength
+    # is likely. So the form of the library is no rival.
     known = [
-        form for form in forms if cause.name is None or form.effect != cause.name or column in form.columns
+        replace(form, effect=cause.name, scales=(1.0,)) if form.effect == own[number] else form
+        for form in closed.forms
+        if form.effect == own[number] or form.effect not in (*own, cause.name) or form.effect is None
     ]
     prior = prior_of(known)
     weights = np.array([np.log(ONE * prior[form]) + closed.of_form(form)[0] for form in known])
     whole = np.concatenate([np.full((1, DRAWS), np.log(NONE)), weights])
-    shares = np.exp(whole - logsumexp(whole, axis=0))
     right = {"name": 0, "family": 0, "stage": 0}
     detected, stages = 0, {FAMILIES[family].stage for family in cause.families}
-    for draw in shares.T:
+    for draw in np.exp(whole - logsumexp(whole, axis=0)).T:
         by_label: dict[Labels, float] = {frozenset(): float(draw[0])}
         for form, share in zip(known, draw[1:], strict=True):
             label = frozenset([label_of(form)])
@@ -138,17 +135,13 @@ def _bound(
         if not told:
             continue
         detected += 1
-        labels = [(one.family.name, one.effect) for one in told[0].alternatives]
-        right["name"] += len(labels) == 1 and labels[0][1] == cause.name and labels[0][0] in cause.families
-        right["family"] += all(family in cause.families for family, _ in labels)
-        right["stage"] += all(one.stage in stages for one in told[0].alternatives)
+        alternatives = told[0].alternatives
+        families = all(one.family.name in cause.families for one in alternatives)
+        right["name"] += families and [one.effect for one in alternatives] == [cause.name]
+        right["family"] += families
+        right["stage"] += all(one.stage in stages for one in alternatives)
     noncentrality = float(closed.normal(np.array([column]))[0, 0])
     return Bound(noncentrality, detected / DRAWS, *(count / DRAWS for count in right.values()))
-
-
-def _as_known(form: Form, own: str, cause: TrueCause) -> Form:
-    """The form of the true cause under the name of the library, and with one scale: its strength is as likely as the true one."""
-    return replace(form, effect=cause.name, scales=(1.0,)) if form.effect == own else form
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -18,18 +18,15 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from psfcore.errors import DataError
 from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.verdict.correction import Corrected
 from psfcore.gap.view import Field, View
-from psfcore.psf import REACH_GRID_PX, Psf
+from psfcore.psf import REACH_GRID_PX, Kernel, Psf
 from psfcore.scatter.fit import psf_of_fit
 from psfcore.scatter.total_psf import Blur, Lanes, Optics, TotalPsf
 from psfcore.transit.transit import Place
-
-Kernel = NDArray[np.float64]
 
 
 def corrected_psf(found: Diagnosis, name: str, version: str, provenance: dict[str, Any]) -> Psf:

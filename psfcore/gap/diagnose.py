@@ -16,12 +16,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from psfcore.errors import DataError
 from psfcore.gap.effect import Effect
-from psfcore.gap.evidence.closed_form import Variant
 from psfcore.gap.evidence.columns import FieldShape, with_effect
 from psfcore.gap.evidence.effect_fits import EffectFit, fit_effects, label_of, p_value_of_gap
 from psfcore.gap.evidence.evidence import Evidence
@@ -30,7 +30,7 @@ from psfcore.gap.evidence.linear_model import LinearModel
 from psfcore.gap.evidence.measured_noise import MeasuredNoise, measured_noise
 from psfcore.gap.library.registry import LIBRARY
 from psfcore.gap.library.scene import MOST_POINTINGS
-from psfcore.gap.verdict.answer import LEAST_IMAGES, Alternative, Answer, answer_of
+from psfcore.gap.verdict.answer import LEAST_IMAGES, Answer, answer_of
 from psfcore.gap.verdict.calibration import COVERAGE, Calibration, shipped_calibration
 from psfcore.gap.verdict.closure import (
     HeldOut,
@@ -166,9 +166,9 @@ def diagnose(
         corrected = _refit(view, model, [effects[name] for name in told.names], told, failures, progress)
     schemes = (time_blocks(model), pointings(model))
     held_out = [hold_out(model, (), scheme) for scheme in schemes]
-    closing = _Closing(held_out, schemes, rng, model.scale_error, exists=bool(answer.causes))
-    shrinking = {name: closing.of(fit.model, fit)[0] for name, fit in fits.items()}
-    of_told, after = (None, None) if told is None else closing.of(told.model, told, corrected)
+    closing = partial(_shrinking, held_out, schemes, rng, bool(answer.causes))
+    shrinking = {name: closing(fit)[0] for name, fit in fits.items()}
+    of_told, after = (None, None) if told is None else closing(told, corrected)
     if told is not None and of_told is not None and told.label in shrinking:
         shrinking[told.label] = of_told
     before = held_out[0]
@@ -176,13 +176,9 @@ def diagnose(
     cautions = [*cautions_of(solution, noise, model.evidence), *failures]
     if told is not None and after is not None and rms.low > 0:  # the discs show the gap
         cautions += caution_of_closure(told.label, rms.value, float(np.sqrt(np.mean(after.noise_pct**2))))
-    axes = (
-        []
-        if told is None
-        else [axis for e in told.model.evidence.effects if e.name in told.names for axis in e.axes]
-    )
-    if told is None and answer.causes:
-        axes = list(answer.causes[0].alternatives[0].family.axes)
+    axes = [axis for cause in answer.causes[:1] for axis in cause.alternatives[0].family.axes]
+    if told is not None:
+        axes = [axis for e in told.model.evidence.effects if e.name in told.names for axis in e.axes]
     return Diagnosis(
         answer=answer,
         calibration=calibration,
@@ -198,7 +194,9 @@ def diagnose(
         before_refit=rms if told is None else _before_refit(told, rng),
         rms=rms,
         after=rms if after is None else gap(after.residual_pct, after.noise_pct, rng),
-        noise_pct=_noise_pct(model.evidence),
+        noise_pct=float(
+            np.sqrt(np.mean([(100 * d.mean_noise / d.level) ** 2 for d in model.evidence.discs]))
+        ),
         shrinking=shrinking,
         shrinking_of_told=of_told,
         corrected=corrected,
@@ -243,20 +241,14 @@ def _shapes(answer: Answer) -> dict[str, FieldShape]:
         for one in cause.alternatives:
             variant = answer.variant((one.family.name, one.effect))
             if variant is not None and variant.form.field is not None:
-                values, covariance = answer.closed.fitted(_with_others(answer, one, variant))
+                others = [other.alternatives[0] for other in answer.causes if one not in other.alternatives]
+                beside = [answer.variant((other.family.name, other.effect)) for other in others]
+                values, covariance = answer.closed.fitted([variant, *filter(None, beside)])
                 own = slice(0, variant.part.size)
-                shape = answer.closed.columns.shape(
+                found[one.family.name] = answer.closed.columns.shape(
                     variant.form.field, variant.part.tolist(), values[own], covariance[own, own]
                 )
-                found[one.family.name] = shape
     return found
-
-
-def _with_others(answer: Answer, one: Alternative, variant: Variant) -> list[Variant]:
-    """A variant, followed by the first alternatives of the other causes."""
-    others = [cause.alternatives[0] for cause in answer.causes if one not in cause.alternatives]
-    found = [answer.variant((other.family.name, other.effect)) for other in others]
-    return [variant, *(other for other in found if other is not None)]
 
 
 def _refit(
@@ -279,35 +271,33 @@ def _refit(
         return_unused_memory()
 
 
-@dataclass(frozen=True, eq=False)
-class _Closing:
-    """Computes how far fits close the gap. before: the held-out residuals without any cause, for each scheme. exists: whether there is a gap."""
+def _shrinking(
+    before: Sequence[HeldOut | None],
+    schemes: Sequence[Sequence[Fold]],
+    rng: np.random.Generator,
+    exists: bool,
+    fit: EffectFit,
+    refit: Corrected | None = None,
+) -> tuple[Shrinking, HeldOut | None]:
+    """How far a fit closes the gap, and the held-out residuals with it.
 
-    before: Sequence[HeldOut | None]
-    schemes: Sequence[Sequence[Fold]]
-    rng: np.random.Generator
-    scale_error: float
-    exists: bool
-
-    def of(
-        self, model: LinearModel, fit: EffectFit, refit: Corrected | None = None
-    ) -> tuple[Shrinking, HeldOut | None]:
-        """The closure by a fit, and the held-out residuals with it. refit: its full refit, whose model is used if there is one."""
-        base = len(model.evidence.base)
-        after = [hold_out(model, fit.step.columns[base:], scheme) for scheme in self.schemes]
-        if refit is not None:
-            real = refit.model
-            refitted = [hold_out(real, real.evidence.of_effects, scheme) for scheme in self.schemes]
-            after = [_better_known(*both) for both in zip(refitted, after, strict=True)]
-        closures = [
-            closure(b, a, self.rng, self.scale_error)
-            if self.exists and b is not None and a is not None
-            else None
-            for b, a in zip(self.before, after, strict=True)
-        ]
-        first, last = self.before[0], after[0]
-        falls = fall(first, last) if first is not None and last is not None else None
-        return Shrinking(closures[0], closures[1], falls), last
+    before: the held-out residuals without any cause, for each scheme. exists: whether there is a gap. refit: the full
+    refit of the fit; its results are used where it holds out the same images.
+    """
+    base = len(fit.model.evidence.base)
+    after = [hold_out(fit.model, fit.step.columns[base:], scheme) for scheme in schemes]
+    if refit is not None:
+        own = range(base, refit.model.evidence.size)
+        real = [hold_out(refit.model, own, scheme) for scheme in schemes]
+        both = zip(real, after, strict=True)
+        after = [one if one and other and one.images == other.images else other for one, other in both]
+    closures = [
+        closure(b, a, rng, fit.model.scale_error) if exists and b is not None and a is not None else None
+        for b, a in zip(before, after, strict=True)
+    ]
+    first, last = before[0], after[0]
+    falls = fall(first, last) if first is not None and last is not None else None
+    return Shrinking(closures[0], closures[1], falls), last
 
 
 def start_of(psf: Psf) -> tuple[Shape, Vector]:
@@ -335,28 +325,15 @@ def _limits(answer: Answer, refit: Corrected | None) -> Limits:
     return found
 
 
-def _better_known(real: HeldOut | None, linear: HeldOut | None) -> HeldOut | None:
-    """The result of the full refit (`real`) if it holds out the same images as the linear model; otherwise `linear`."""
-    same = real is not None and linear is not None and real.images == linear.images
-    return real if same else linear
-
-
 def _before_refit(best: EffectFit, rng: np.random.Generator) -> Interval:
     """The gap with the PSF that was fitted together with the best effects, but without these effects.
 
     A refit of the PSF without the effects absorbs a part of this gap.
     """
-    base = list(best.model.evidence.base)
-    rows = []
-    for disc in best.model.evidence.discs:
-        mean = float(disc.share @ (disc.residual - disc.jacobian[base].T @ best.step.values[: len(base)]))
-        rows.append((-100 * mean / disc.level, 100 * disc.mean_noise / disc.level))
-    residual, noise = np.array(rows).T
-    return gap(residual, noise, rng)
-
-
-def _noise_pct(evidence: Evidence) -> float:
-    return float(np.sqrt(np.mean([(100 * d.mean_noise / d.level) ** 2 for d in evidence.discs])))
+    base, discs = list(best.model.evidence.base), best.model.evidence.discs
+    left = (disc.residual - disc.jacobian[base].T @ best.step.values[: len(base)] for disc in discs)
+    residual = [-100 * float(d.share @ one) / d.level for d, one in zip(discs, left, strict=True)]
+    return gap(np.array(residual), np.array([100 * d.mean_noise / d.level for d in discs]), rng)
 
 
 # --- cautions ---------------------------------------------------------------------------------------------
@@ -367,43 +344,49 @@ def cautions_of(solution: Solution, noise: MeasuredNoise | None, evidence: Evide
     out = []
     if noise is None:
         out.append(
-            "The stated noise could not be checked. Either too few consecutive images have the same pointing, gain mode and "
-            "exposure, or their differences do not look like noise."
+            "The stated noise could not be checked. Either too few consecutive images have the same pointing, gain "
+            "mode and exposure, or their differences do not look like noise."
         )
     elif not noise.agrees:
         out.append(
-            f"The variance of the noise in the images is {noise.ratio:.2f} times the stated variance. The measured noise was used: "
-            f"{noise.noise.photon_gain_dn:.2f} DN per photon, read noise {noise.noise.read_noise_dn:.2f} DN."
+            f"The variance of the noise in the images is {noise.ratio:.2f} times the stated variance. The measured "
+            f"noise was used: {noise.noise.photon_gain_dn:.2f} DN per photon, read noise "
+            f"{noise.noise.read_noise_dn:.2f} DN."
         )
     left_out = [f"{name}: {why}" for name, why in solution.inversion.left_out.items()]
-    if left_out:
-        out.append(f"{len(left_out)} images were not used. Examples: {'; '.join(left_out[:3])}")
     infos = [evidence.image_info[disc.index] for disc in evidence.discs]
     unmatched = [info.file for info in infos if not info.described]
-    if unmatched:
-        out.append(
-            f"In {len(unmatched)} images ({', '.join(unmatched[:3])}{', …' if len(unmatched) > 3 else ''}) the scene around the "
-            "occulter differs from the scene in the neighbouring images, or no neighbouring image shows it. The fitted position of the "
-            "occulter may be wrong in these images, and the wrong position may cause the residuals in their discs."
-        )
-    if len(infos) < LEAST_IMAGES:
-        out.append(
-            f"With only {len(infos)} images, no image can be held out. Closure and the gap on held-out images are therefore missing."
-        )
+    some = f"{', '.join(unmatched[:3])}{', …' if len(unmatched) > 3 else ''}"
     aimed = len({info.pointing for info in evidence.image_info})
-    if aimed > MOST_POINTINGS:
-        out.append(
-            f"Light from outside the field was tested only in the first {MOST_POINTINGS} of the {aimed} pointings."
-        )
-    if aimed == 1:
-        out.append(
-            "All images have the same pointing: effects that differ between pointings cannot be detected, and no pointing can be held out."
-        )
-    if len({info.exposure_s for info in evidence.image_info}) == 1:
-        out.append(
-            "All images have the same exposure time: an error of every readout (in DN) and an error of the rate (in DN/s) look the same."
-        )
-    return tuple(out)
+    rows = (
+        (left_out, f"{len(left_out)} images were not used. Examples: {'; '.join(left_out[:3])}"),
+        (
+            unmatched,
+            f"In {len(unmatched)} images ({some}) the scene around the occulter differs from the scene in the "
+            "neighbouring images, or no neighbouring image shows it. The fitted position of the occulter may be wrong "
+            "in these images, and the wrong position may cause the residuals in their discs.",
+        ),
+        (
+            len(infos) < LEAST_IMAGES,
+            f"With only {len(infos)} images, no image can be held out. Closure and the gap on held-out images are "
+            "therefore missing.",
+        ),
+        (
+            aimed > MOST_POINTINGS,
+            f"Light from outside the field was tested only in the first {MOST_POINTINGS} of the {aimed} pointings.",
+        ),
+        (
+            aimed == 1,
+            "All images have the same pointing: effects that differ between pointings cannot be detected, and no "
+            "pointing can be held out.",
+        ),
+        (
+            len({info.exposure_s for info in evidence.image_info}) == 1,
+            "All images have the same exposure time: an error of every readout (in DN) and an error of the rate (in "
+            "DN/s) look the same.",
+        ),
+    )
+    return (*out, *(sentence for holds, sentence in rows if holds))
 
 
 def caution_of_closure(label: str, gap_pct: float, error_pct: float) -> tuple[str, ...]:

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits
@@ -29,15 +28,13 @@ from psfcore.gap.view import View
 from psfcore.instruments.files import instrument_names
 from psfcore.scatter.inversion import invert
 from psfcore.scatter.reconstruction import Progress
-from psfcore.scatter.shapes import SOFTENED_POWER_LAW
+from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Kernel
 from psfcore.simulate.inputs import LARGEST_DIFFRACTION_PX, diffraction_kernel, read_plan
 from psfcore.simulate.plan import Plan
 from psfcore.simulate.scatter_truth import ScatterTruth
 from psfcore.simulate.sky import true_sky
 from psfcore.simulate.transit import observed_transit
 from psfcore.transit.transit import Transit
-
-Kernel = NDArray[np.float64]
 
 SCHEMA = "gap-plan/1"
 INSTRUMENT = "hri_euv"

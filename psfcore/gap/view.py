@@ -22,6 +22,7 @@ from psfcore.transit.occulter import coverage, disc_distance, neighbours_of, pat
 
 Field = NDArray[np.float32]
 Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
 Result = TypeVar("Result")
 DISC_MARGIN_PX = 2.0
 # Most memory for one kind of field; at least LEAST_KEPT fields are kept, whatever their size.

@@ -6,7 +6,6 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from psfcore.blind.effects.effect import (
@@ -18,6 +17,7 @@ from psfcore.blind.effects.effect import (
     Earlier,
     Effect,
     Moment,
+    Plane,
     coin,
     declare,
     direction,
@@ -29,8 +29,6 @@ from psfcore.blind.effects.effect import (
 from psfcore.blind.effects.fine_optics import FINE
 from psfcore.blind.effects.scene import patches
 from psfcore.simulate.plan import COMBINED, Plan
-
-Plane = NDArray[np.float64]
 
 
 @declare(

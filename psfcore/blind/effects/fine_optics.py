@@ -23,16 +23,15 @@ from dataclasses import dataclass, replace
 from functools import cache, cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import convolve1d
 
 from psfcore.build import build_psf
 from psfcore.convolution.convolver import Convolver, linear_convolve
 from psfcore.diffraction.mesh_series import order_spacing_px, rotated_mesh_kernel
 from psfcore.instruments.model import load_instrument
+from psfcore.psf import Kernel
 from psfcore.simulate.scatter_truth import ScatterTruth
 
-Kernel = NDArray[np.float64]
 FINE = 2
 # The weights in Eq. (1) along one axis: the fraction of pairs (s, t) of fine pixels with each offset.
 _TRIANGLE = 1 - np.abs(np.arange(1 - FINE, FINE)) / FINE

@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import affine_transform, gaussian_filter
 
 from psfcore.blind.effects.effect import (
@@ -16,6 +15,7 @@ from psfcore.blind.effects.effect import (
     VARIES,
     Effect,
     Moment,
+    Plane,
     coin,
     declare,
     direction,
@@ -25,7 +25,6 @@ from psfcore.blind.effects.effect import (
 from psfcore.blind.effects.fine_optics import FINE, FineOptics, scaled_scatter, turned_offsets
 from psfcore.convolution.convolver import linear_convolve
 
-Plane = NDArray[np.float64]
 _HALF_TURN = (0.0, 180.0)
 _FINER = 9  # number of samples in a fine pixel along each axis
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, zoom
 from scipy.optimize import brentq
 
@@ -16,6 +15,7 @@ from psfcore.blind.effects.effect import (
     KNOWN,
     Effect,
     Moment,
+    Plane,
     declare,
     direction,
     seed,
@@ -25,8 +25,6 @@ from psfcore.blind.effects.fine_optics import FINE
 from psfcore.simulate.plan import HIGH, Plan
 from psfcore.simulate.sky import Behind, covered_share
 from psfcore.transit.transit import Place
-
-Plane = NDArray[np.float64]
 
 
 @declare(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from psfcore.blind.effects.effect import (
@@ -16,6 +15,7 @@ from psfcore.blind.effects.effect import (
     Earlier,
     Effect,
     Moment,
+    Plane,
     coin,
     declare,
     direction,
@@ -26,8 +26,6 @@ from psfcore.blind.effects.effect import (
 from psfcore.blind.effects.fine_optics import FINE, FineOptics, turned_offsets
 from psfcore.simulate.plan import Plan
 from psfcore.simulate.sky import Behind
-
-Plane = NDArray[np.float64]
 
 
 @declare(

@@ -26,11 +26,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.gap.view import Matrix, Vector
 from psfcore.scatter.reconstruction import Solution
 from psfcore.scatter.total_psf import Optics, Pixels, put
 
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
 Planes = NDArray[np.float32]
 
 # Inner and outer radius (fractions of the radius of the outermost dark pixel), number of sectors.
@@ -60,8 +59,7 @@ def cells_of(dark: Pixels, x_px: float, y_px: float) -> Cells:
 
     x_px, y_px: the centre of the disc.
     """
-    rows, columns = dark
-    dx, dy = columns - x_px, rows - y_px
+    dx, dy = dark[1] - x_px, dark[0] - y_px
     r = np.hypot(dx, dy)
     share = r / max(float(r.max()), 1e-9)
     angle = np.arctan2(dy, dx)
@@ -72,12 +70,11 @@ def cells_of(dark: Pixels, x_px: float, y_px: float) -> Cells:
         members.extend(ring & (sector == k) for k in range(sectors))
     kept = [m for m in members if m.sum() >= LEAST_PIXELS]
     weights = np.array([m / m.sum() for m in kept])
-    centre = np.exp(1j * angle)
     return Cells(
         weights=weights,
         pixels=np.array([float(m.sum()) for m in kept]),
         radius=weights @ share,
-        azimuth=np.angle(weights @ (centre * share)),
+        azimuth=np.angle(weights @ (np.exp(1j * angle) * share)),
     )
 
 
@@ -169,8 +166,7 @@ class DiscCells:
 
 def disc_cells(solution: Solution, n: int) -> tuple[DiscCells, Planes]:
     """The cells of frame n, with an empty Jacobian, and the sensitivities of these cells (cells, ny, nx)."""
-    place = solution.sky.found[n].place
-    dark = solution.sky.dark[n]
+    place, dark = solution.sky.found[n].place, solution.sky.dark[n]
     cells = cells_of(dark, place.x_px, place.y_px)
     residual, expected = solution.residual(n)
     planes = sensitivities(solution.optics, dark, cells.weights)

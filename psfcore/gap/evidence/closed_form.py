@@ -45,9 +45,8 @@ from psfcore.gap.evidence.columns import LIKELY, FieldColumns
 from psfcore.gap.evidence.linear_model import WEAKEST, LinearModel
 from psfcore.gap.evidence.tree import SUN, Field, family_of, fields_of
 from psfcore.gap.evidence.unocculted_blocks import LEAST_IMAGES
+from psfcore.gap.view import Matrix, Vector
 
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
 Columns = NDArray[np.intp]
 Sun = tuple[str, float]  # the course and the size of the Sun in the model
 
@@ -132,13 +131,8 @@ class Inexact:
         """The change by these causes. design: (..., columns). numbers: of its columns; other columns are 0 there."""
         place = {number: k for k, number in enumerate(numbers.tolist())}
         columns = np.concatenate([one.columns for one in self.variants]).tolist()
-        shown = [
-            (place[column], value)
-            for column, value in zip(columns, self.values, strict=True)
-            if column in place
-        ]
-        at, values = [k for k, _ in shown], [value for _, value in shown]
-        return np.asarray(design[..., at] @ np.array(values))
+        shown = [k for k, column in enumerate(columns) if column in place]
+        return np.asarray(design[..., [place[columns[k]] for k in shown]] @ self.values[shown])
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,17 +161,11 @@ class ClosedForm:
         inexact: Inexact | None = None,
         draws: tuple[Matrix, Matrix] | None = None,
     ) -> None:
-        evidence = model.evidence
-        self.model, self.columns, self._inexact, self._draws = (
-            model,
-            columns or FieldColumns(evidence),
-            inexact,
-            draws,
-        )
-        infos = evidence.image_info
+        self.model, self._inexact, self._draws = model, inexact, draws
+        self.columns = columns or FieldColumns(model.evidence)
+        infos, first = model.evidence.image_info, model.evidence.size
         exposures = len({info.exposure_s for info in infos}) > 1
         kinds = len({(info.exposure_s, info.gain_mode) for info in infos}) > 1
-        first = evidence.size
         self.spans: dict[Field, range] = {}
         for field in fields_of(sorted({info.pointing for info in infos}), exposures=exposures, kinds=kinds):
             self.spans[field] = range(first, first := first + self.columns.count(field))
@@ -191,36 +179,23 @@ class ClosedForm:
         """All forms: the effects of the library, the fields, and the Sun."""
         evidence, found = self.model.evidence, []
         for effect in evidence.effects:
-            if not evidence.columns[effect.name]:
-                continue
-            pairs = list(zip(evidence.columns[effect.name], effect.parameters, strict=False))
-            numbers = np.array([column for column, _ in pairs], dtype=np.intp)
-            likely = np.array([parameter.likely for _, parameter in pairs])
-            positive = np.array([parameter.positive for _, parameter in pairs], np.bool_)
+            own = evidence.columns[effect.name][: len(effect.parameters)]
+            numbers = np.array(own, dtype=np.intp)
             templates = math.log(max(evidence.templates.get(effect.name, 1.0), 1.0))
-            family = family_of(effect)
-            found.append(Form(family, effect.name, None, numbers, likely, positive, log_templates=templates))
-        names = {effect.name for effect in evidence.effects}
-        for field, span in self.spans.items():
-            one_sign = np.zeros(len(span), np.bool_)
-            squares = tuple(self.columns.squares(field))
-            likely = np.full(len(span), LIKELY)
-            numbers = np.array(span, dtype=np.intp)
-            found.append(
-                Form(
-                    field.family,
-                    None,
-                    field,
-                    numbers,
-                    likely,
-                    one_sign,
-                    FIELD_SCALES,
-                    squares,
-                    field.everywhere,
+            prior = evidence.prior.likely[numbers], evidence.prior.positive[numbers]
+            if own:
+                found.append(
+                    Form(family_of(effect), effect.name, None, numbers, *prior, log_templates=templates)
                 )
+        for field, span in self.spans.items():
+            numbers = np.array(span, dtype=np.intp)
+            prior = np.full(len(span), LIKELY), np.zeros(len(span), np.bool_)
+            squares = tuple(self.columns.squares(field))
+            found.append(
+                Form(field.family, None, field, numbers, *prior, FIELD_SCALES, squares, field.everywhere)
             )
-        nothing = np.zeros(0)
-        if self._block_count and SUN in names:
+        if self._block_count and any(effect.name == SUN for effect in evidence.effects):
+            nothing = np.zeros(0)
             found.append(Form("sun", SUN, None, nothing.astype(np.intp), nothing, nothing.astype(np.bool_)))
         return tuple(found)
 
@@ -267,12 +242,10 @@ class ClosedForm:
             if here.size < LEAST_IMAGES:
                 continue
             own = [np.moveaxis(blocks.errors[:, here], 0, -1)]
-            own += [self.columns.blocks(field, pointing, here.tolist()) for field in self._fields_of_blocks]
+            own += [self.columns.blocks(one, pointing, here.tolist()) for one in self.spans if one.in_blocks]
             columns = np.concatenate(own, axis=2)
-            variance, change = (
-                blocks.variance[here] * model.unocculted_scale,
-                np.zeros(blocks.levels[here].shape),
-            )
+            variance = blocks.variance[here] * model.unocculted_scale
+            change = np.zeros(variance.shape)
             if self._inexact is not None:
                 # The scene absorbs what all images share.
                 change = self._inexact.change(columns, self._in_blocks)
@@ -320,14 +293,9 @@ class ClosedForm:
         return out, count
 
     @cached_property
-    def _fields_of_blocks(self) -> list[Field]:
-        """The fields that differ between images of one pointing, so that the blocks show them."""
-        return [field for field in self.spans if field.in_blocks]
-
-    @cached_property
     def _in_blocks(self) -> Columns:
-        """The numbers of the columns that are computed for the blocks."""
-        spans = [np.array(self.spans[field]) for field in self._fields_of_blocks]
+        """The numbers of the columns that are computed for the blocks: of effects, and of fields that blocks show."""
+        spans = [np.array(span) for field, span in self.spans.items() if field.in_blocks]
         return np.concatenate([np.arange(self.model.evidence.size), *spans]).astype(np.intp)
 
     @cached_property
@@ -407,13 +375,10 @@ class ClosedForm:
         form = squares[0].form
         normal, score = self.normal(form.columns), self.score(form.columns)
         parts = np.array([one.part for one in squares])
-        width = np.array([one.width for one in squares])
-        inner = (
-            np.eye(parts.shape[1])
-            + normal[parts[:, :, None], parts[:, None, :]] * width[:, :, None] * width[:, None, :]
-        )
-        lower = np.linalg.cholesky(inner)
-        z = np.linalg.solve(lower, score[parts] * width[:, :, None])
+        width = np.array([one.width for one in squares])[:, :, None]
+        inner = normal[parts[:, :, None], parts[:, None, :]] * width * np.swapaxes(width, 1, 2)
+        lower = np.linalg.cholesky(np.eye(parts.shape[1]) + inner)
+        z = np.linalg.solve(lower, score[parts] * width)
         log_det = np.log(np.einsum("kcc->kc", lower)).sum(axis=1)
         cost = np.array([one.cost for one in squares])
         return np.asarray((z**2).sum(axis=1) / 2 - (log_det + cost)[:, None])
@@ -451,19 +416,16 @@ class ClosedForm:
         columns, width, positive, _ = _joined(variants)
         normal, score = self.normal(columns, sun), self.score(columns, sun)[:, 0]
         keep = np.ones(columns.size, np.bool_)
-        values, inverse = np.zeros(0), np.zeros((0, 0))
+        out, covariance = np.zeros(columns.size), np.zeros((columns.size,) * 2)
         while keep.any():
             at = np.flatnonzero(keep)
             inverse = scaled_inverse(normal[np.ix_(at, at)] + np.diag(width[at] ** -2.0), weakest=WEAKEST)
             values = inverse @ score[at]
             below = positive[at] & (values < 0)
             if not below.any():
+                out[at], covariance[np.ix_(at, at)] = values, inverse
                 break
             keep[at[np.argmin(np.where(below, values / np.sqrt(np.diag(inverse)), 0.0))]] = False
-        out, covariance = np.zeros(columns.size), np.zeros((columns.size,) * 2)
-        out[keep], covariance[np.ix_(keep, keep)] = (
-            (values, inverse) if keep.any() else (0.0, np.zeros((0, 0)))
-        )
         return out, covariance
 
     def chi2_left(self, variants: Sequence[Variant], sun: Sun | None = None) -> tuple[float, float]:

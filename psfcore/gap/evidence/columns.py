@@ -45,10 +45,7 @@ from psfcore.gap.effect import Change, Effect, EffectParameter
 from psfcore.gap.evidence.cells import DiscCells
 from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.tree import FAMILIES, WIDTHS, Field
-
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
-Planes = NDArray[np.float64]
+from psfcore.gap.view import Matrix, Vector
 
 LIKELY = 0.02  # likely relative size of a coefficient; the evidence also tries ten times this size
 KERNEL_LIKELY, OUTSIDE_LIKELY = (
@@ -87,7 +84,7 @@ class Responses:
     zero if the operator does not reach the blocks. size: size_n of each image (images,).
     """
 
-    discs: Planes
+    discs: Matrix
     blocks: dict[int, Matrix]
     size: Vector
 
@@ -105,27 +102,25 @@ class FieldColumns:
         self.times = np.asarray(2 * (times - times.min()) / max(float(np.ptp(times)), 1e-9) - 1)
         rows, columns = self._discs[0].boxes.shape[-2:]
         self.at = _middles(rows), _middles(columns)
-        down = self._blocks.levels.shape[1] // self._blocks.across
-        self._block_at = _middles(down), _middles(self._blocks.across)
+        across = self._blocks.across
+        self._block_at = _middles(self._blocks.levels.shape[1] // across), _middles(across)
         self._cells = max(disc.residual.size for disc in self._discs)
         self._of: dict[tuple[str, float | None], Responses] = {}
 
-    def discs(self, field: Field) -> Planes:
+    def discs(self, field: Field) -> Matrix:
         """The columns of a field in the discs: (discs, cells, columns), DN/s."""
         of, weight = self._responses(field), self._modulation(field)
         images = list(self._evidence.images)
-        by_image = of.size[images, None] * weight[images]
-        out = of.discs[:, :, :, None] * by_image[:, None, None, :]
+        out = of.discs[..., None] * (of.size[images, None] * weight[images])[:, None, None, :]
         return np.asarray(out.reshape(*of.discs.shape[:2], -1))
 
-    def blocks(self, field: Field, pointing: int, images: Sequence[int]) -> Planes:
+    def blocks(self, field: Field, pointing: int, images: Sequence[int]) -> Matrix:
         """The columns of a field in the blocks of images of one pointing: (images, blocks, columns), DN/s."""
-        of, weight = self._responses(field), self._modulation(field)
-        by_image = of.size[list(images), None] * weight[list(images)]
-        out = of.blocks[pointing][None, :, :, None] * by_image[:, None, None, :]
-        return np.asarray(out.reshape(len(by_image), self._blocks.levels.shape[1], -1))
+        of, weight, here = self._responses(field), self._modulation(field), list(images)
+        out = of.blocks[pointing][..., None] * (of.size[here, None] * weight[here])[:, None, None, :]
+        return np.asarray(out.reshape(*out.shape[:2], -1))
 
-    def all_blocks(self, field: Field) -> Planes:
+    def all_blocks(self, field: Field) -> Matrix:
         """The columns of a field in the blocks of all images: (images, blocks, columns), DN/s."""
         pointing = self._blocks.pointing
         out = np.zeros((*self._blocks.levels.shape, self.count(field)))
@@ -157,10 +152,8 @@ class FieldColumns:
         infos = self._infos
         if field.modulation in ("constant", "place"):
             return np.ones((len(infos), 1))
-        if field.modulation == "pointing":
-            return np.array([[float(info.pointing == field.pointing)] for info in infos])
-        if field.modulation == "pointings":
-            every = sorted({info.pointing for info in infos})
+        if field.modulation.startswith("pointing"):
+            every = sorted({info.pointing for info in infos}) if field.pointing is None else [field.pointing]
             return np.array([[float(info.pointing == one) for one in every] for info in infos])
         if field.modulation == "kind":
             kinds = [(info.exposure_s, info.gain_mode) for info in infos]
@@ -199,7 +192,7 @@ class FieldColumns:
         """The change by a coefficient of 1 where its bump is 1: DN/s, or a share of the light."""
         return KERNEL_LIKELY if operator in _OF_PSF else 1.0 if operator == "gain" else self._light
 
-    def _forms(self, operator: str, width: float | None, scene: Matrix) -> Planes:
+    def _forms(self, operator: str, width: float | None, scene: Matrix) -> Matrix:
         """The change of an image by each form (forms, boxes along y, boxes along x), DN/s; for a gain relative to the image.
 
         scene: of the image, on the boxes.
@@ -210,9 +203,7 @@ class FieldColumns:
             return self._size(operator) * _patterns(*self.at, width)
         scene = self._size(operator) * scene
         if operator == "kernel":
-            return np.array(
-                [*(kernel.apply(scene) for kernel in self._kernels), _core(scene)], dtype=np.float64
-            )
+            return np.array([*(one.apply(scene) for one in self._kernels), _core(scene)], dtype=np.float64)
         rings = self._kernels[:: len(_FACTORS)]
         if operator == "scatter":
             assert width is not None
@@ -220,10 +211,9 @@ class FieldColumns:
             weighted = scene * _patterns(*self.at, width)
             return np.array([rings[k].apply(one) for one in weighted for k in chosen], dtype=np.float64)
         changed = np.array([ring.apply(scene) for ring in rings], dtype=np.float64)
-        y, x = self.at
         if operator == "ring":
             return np.concatenate([changed, _core(scene)[None]])
-        return np.concatenate([changed * x, changed * y[:, None]])
+        return np.concatenate([changed * self.at[1], changed * self.at[0][:, None]])
 
     @cached_property
     def _scenes(self) -> dict[int, Matrix]:
@@ -235,12 +225,10 @@ class FieldColumns:
         own = [scene for n, scene in self._scenes.items() if self._infos[n].pointing == pointing]
         return np.median(own, axis=0) if own else np.zeros([one.size for one in self.at])
 
-    def _in_discs(self, operator: str, width: float | None) -> Planes:
+    def _in_discs(self, operator: str, width: float | None) -> Matrix:
         """q . e of every form for every cell (discs, cells, forms)."""
-        relative = int(operator == "gain")
-        each = [
-            disc.boxes[relative].reshape(disc.residual.size, -1).astype(np.float64) for disc in self._discs
-        ]
+        boxes = (disc.boxes[int(operator == "gain")] for disc in self._discs)
+        each = [one.reshape(len(one), -1).astype(np.float64) for one in boxes]
         if operator in _OF_PSF:
             planes = (self._forms(operator, width, self._scenes[disc.index]) for disc in self._discs)
             found = [q @ one.reshape(len(one), -1).T for q, one in zip(each, planes, strict=True)]
@@ -256,14 +244,14 @@ class FieldColumns:
         """Some coefficients of a field as an effect. likely: the likely size of each coefficient."""
         weight, edge = self._modulation(field), self._evidence.box_px
         size = self._readouts if field.operator == "offset" else np.ones(len(weight))
-        last: dict[int, Planes] = {}
+        last: dict[int, Matrix] = {}
 
         def change(n: int, images: Sequence[NDArray[np.float32]], k: int) -> NDArray[np.float32]:
             if n not in last:
                 last.clear()
-                of_disc = self._scenes.get(n)
-                pointing = self._infos[n].pointing
-                scene = self._scene_of_pointing(pointing) if of_disc is None else of_disc
+                scene = self._scenes.get(n)
+                if scene is None:
+                    scene = self._scene_of_pointing(self._infos[n].pointing)
                 last[n] = self._forms(field.operator, field.width_of_forms, scene)
             form, time = divmod(part[k], weight.shape[1])
             plane = (size[n] * weight[n, time] * last[n][form]).repeat(edge, axis=0).repeat(edge, axis=1)
@@ -294,15 +282,14 @@ class FieldColumns:
         weight, optics = self._modulation(field), field.operator in _OF_PSF
         forms = self._responses(field).discs.shape[2]
         (y, x), edge = self.at, self._evidence.box_px
-        axes: tuple[str, ...] = ()
-        at: Matrix = np.zeros((0, 0))
-        of_forms: Matrix = np.zeros((0, forms))
-        now = weight[-1:]
+        axes, at = tuple[str, ...](), np.zeros((0, 0))
+        of_forms, now = np.zeros((0, forms)), weight[-1:]
         if field.operator == "kernel":
-            axes = ("radius_px",)
-            at = np.array([[edge * 2.0**octave] for octave in self.octaves.tolist()], dtype=np.float64)
-            of_rings = np.kron(self._rings.T, np.eye(1, len(_FACTORS)))
-            of_forms = np.asarray(np.pad(of_rings, ((0, 0), (0, 1))), dtype=np.float64)
+            axes, at = ("radius_px",), np.array([[edge * 2.0**octave] for octave in self.octaves.tolist()])
+            # The light of each bump in an octave around each radius.
+            apart = self.octaves[:, None] - self.octaves
+            rings = np.exp(-0.5 * (apart / OCTAVES) ** 2) / (OCTAVES * np.sqrt(2 * np.pi))
+            of_forms = np.pad(np.kron(rings, np.eye(1, len(_FACTORS))), ((0, 0), (0, 1)))
         elif field.operator == "ring" or (field.modulation == "time" and field.operator != "tilted_kernel"):
             axes, at = ("time_s",), np.array([[info.time_s] for info in self._infos])
             of_forms, now = np.eye(1, forms), weight
@@ -323,7 +310,7 @@ class FieldColumns:
         blocks = self._blocks.levels.shape[1]
         return {int(p): np.zeros((blocks, forms)) for p in np.unique(self._blocks.pointing)}
 
-    def _to_blocks(self, planes: Planes) -> Matrix:
+    def _to_blocks(self, planes: Matrix) -> Matrix:
         """Means over the blocks (blocks, forms) of planes on the boxes; a block has a whole number of boxes, or the nearest box counts."""
         (rows, columns), (down, across) = planes.shape[1:], (one.size for one in self._block_at)
         edge = rows // down
@@ -335,7 +322,7 @@ class FieldColumns:
         y, x = (np.arange(n) * size // n for n, size in ((down, rows), (across, columns)))
         return np.asarray(planes[:, y[:, None], x].reshape(len(planes), -1).T)
 
-    def _patterns_of_discs(self) -> Planes:
+    def _patterns_of_discs(self) -> Matrix:
         out = np.zeros((len(self._discs), self._cells, EDGE_FORMS))
         for k, disc in enumerate(self._discs):
             own = np.vstack([np.ones(disc.residual.size), disc.patterns]).T
@@ -360,27 +347,18 @@ class FieldColumns:
         return np.arange(np.log2(NEAREST_BOXES), np.log2(reach), OCTAVES)
 
     @cached_property
-    def _rings(self) -> Matrix:
-        """The light of each bump of the optics in an octave around each radius of `octaves` (bumps, radii)."""
-        apart = self.octaves[None] - self.octaves[:, None]
-        return np.asarray(np.exp(-0.5 * (apart / OCTAVES) ** 2) / (OCTAVES * np.sqrt(2 * np.pi)))
-
-    @cached_property
     def _kernels(self) -> list[Convolver]:
         """The convolutions with the changes of the PSF on the boxes, each of sum 1 before its factor of the azimuth."""
         reach = max(one.size for one in self.at)
         d = np.arange(-reach + 1, reach)
         r, a = np.hypot(d[:, None], d[None, :]), np.arctan2(d[:, None], d[None, :])
         octave = np.log2(np.maximum(r, 0.5))
+        rings = (np.exp(-0.5 * ((octave - centre) / OCTAVES) ** 2) for centre in self.octaves)
         shape = self.at[0].size, self.at[1].size
-        kernels = []
-        for centre in self.octaves:
-            ring = np.exp(-0.5 * ((octave - centre) / OCTAVES) ** 2)
-            kernels += [Convolver(ring / ring.sum() * factor(a), shape) for factor in _FACTORS]
-        return kernels
+        return [Convolver(ring / ring.sum() * factor(a), shape) for ring in rings for factor in _FACTORS]
 
     @cached_property
-    def _outside(self) -> Planes:
+    def _outside(self) -> Matrix:
         """The light of each bump beside the field that scatters onto the detector, DN/s."""
         rows, columns = (one.size for one in self.at)
         scene = float(np.mean([disc.scene.mean() for disc in self._discs]))
@@ -419,17 +397,18 @@ def another(family: str) -> str:
     return f"another_{family}"
 
 
-def with_effect(evidence: Evidence, effect: Effect, discs: Planes, blocks: Planes) -> Evidence:
+def with_effect(evidence: Evidence, effect: Effect, discs: Matrix, blocks: Matrix) -> Evidence:
     """The evidence with one more effect. discs: its columns (discs, cells, columns). blocks: (images, blocks, columns)."""
-    more = zip(evidence.discs, discs, strict=True)
-    jacobians = [np.vstack([disc.jacobian, change[: disc.residual.size].T]) for disc, change in more]
-    errors = np.concatenate([evidence.unocculted.errors, np.moveaxis(blocks, -1, 0)])
     own = tuple(range(evidence.size, evidence.size + len(effect.parameters)))
+    errors = np.concatenate([evidence.unocculted.errors, np.moveaxis(blocks, -1, 0)])
     return replace(
         evidence,
         effects=(*evidence.effects, effect),
         columns=evidence.columns | {effect.name: own},
-        discs=tuple(replace(disc, jacobian=one) for disc, one in zip(evidence.discs, jacobians, strict=True)),
+        discs=tuple(
+            replace(disc, jacobian=np.vstack([disc.jacobian, change[: disc.residual.size].T]))
+            for disc, change in zip(evidence.discs, discs, strict=True)
+        ),
         unocculted=replace(evidence.unocculted, errors=errors),
     )
 
@@ -448,7 +427,7 @@ def bumps(at: Sequence[float] | Vector, width: float) -> Matrix:
     return np.asarray(np.exp(-0.5 * ((np.asarray(at)[None] - centres[:, None]) / width) ** 2))
 
 
-def _patterns(y: Vector, x: Vector, width: float | None) -> Planes:
+def _patterns(y: Vector, x: Vector, width: float | None) -> Matrix:
     """The forms of a change on the detector (forms, y, x): bumps of this width; None: 1, x and y."""
     if width is None:
         ones = np.ones((y.size, x.size))

@@ -15,14 +15,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.linear_model import LinearModel, Step
-
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
+from psfcore.gap.view import Vector
 
 # Chi2 of the unocculted field may exceed its degrees of freedom by this fraction without a gap: the Sun always changes a little.
 UNOCCULTED_WIDTH = 0.03
@@ -84,8 +81,7 @@ def fit_effects(model: LinearModel, effects: Sequence[Effect], *, any_sign: bool
         label = parameter.name if len(effects) == 1 else f"{effect.name}.{parameter.name}"
         values[label] = (float(step.values[k]), float(sigma[k]), parameter.unit)
     gain = model.gain(step)
-    trials = math.prod(effect.trials for effect in effects)
-    p_value = _p_value(model, tuple(columns), gain, trials)
+    p_value = _p_value(model, tuple(columns), gain, math.prod(effect.trials for effect in effects))
     return EffectFit(tuple(effect.name for effect in effects), values, gain, p_value, step, model)
 
 
@@ -113,19 +109,18 @@ def _p_value(model: LinearModel, columns: Sequence[int], gain: float, trials: fl
 def p_value_of_gap(model: LinearModel) -> float:
     """The p-value of the gap of a linear model."""
     cells, blocks = left_chi2(model, model.base)
-    freedom = max(sum(disc.residual.size for disc in model.discs) - len(model.base.columns), 1)
-    # Chi2 of the means of the discs: one value for each disc.
-    light = [
+    light = (
         white.white @ disc.expected for disc, white in zip(model.evidence.discs, model.discs, strict=True)
-    ]
+    )
+    # Chi2 of the means of the discs: one value for each disc.
     means = [
         float(one @ left) ** 2 / max(float(one @ one), 1e-300)
         for one, left in zip(light, model.left(model.base), strict=True)
     ]
-    of_means = max(len(means) - len(model.base.columns), 1), sum(means)
+    fitted = len(model.base.columns)
     tests = (
-        (freedom, cells),
-        of_means,
+        (max(sum(disc.residual.size for disc in model.discs) - fitted, 1), cells),
+        (max(len(means) - fitted, 1), sum(means)),
         (model.evidence.all_unocculted.independent, blocks / (1 + UNOCCULTED_WIDTH)),
     )
     return min(1.0, len(tests) * min(float(chdtrc(count, max(chi2, 0.0))) for count, chi2 in tests))

@@ -9,6 +9,7 @@ and of the blocks of the unocculted field (`unocculted_blocks`).
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -31,14 +32,10 @@ from psfcore.gap.evidence.unocculted_blocks import (
     blocks,
     unocculted_blocks,
 )
-from psfcore.gap.view import View
+from psfcore.gap.view import Matrix, Vector, View
 from psfcore.scatter.reconstruction import Progress, Solution
 from psfcore.scatter.total_psf import Blur
-from psfcore.transit.occulter import UNDESCRIBED, FoundPlace
-from psfcore.transit.transit import Frame
-
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
+from psfcore.transit.occulter import UNDESCRIBED
 
 AT_ONCE = 16  # number of fields that are processed together
 
@@ -47,8 +44,8 @@ AT_ONCE = 16  # number of fields that are processed together
 class ImageInfo:
     """The properties of one image: its values on the axes.
 
-    described: whether the neighbouring images in time show the scene around the occulter; the fitted position of the occulter
-    is then reliable.
+    scattering_distance_px: nan if the fit did not use the image. described: whether the neighbouring images in time
+    show the scene around the occulter; the fitted position of the occulter is then reliable.
     """
 
     file: str
@@ -58,7 +55,7 @@ class ImageInfo:
     time_s: float
     exposure_s: float
     gain_mode: str | None
-    scattering_distance_px: float
+    scattering_distance_px: float = math.nan
     described: bool = True
 
 
@@ -73,10 +70,6 @@ class Prior:
     likely: Vector
     positive: NDArray[np.bool_]
     field: NDArray[np.bool_]
-
-    def precision(self, columns: Sequence[int], scale: float | Vector = 1.0) -> Vector:
-        """1 / variance for these columns. scale: the width of the Gaussian, in units of the likely size."""
-        return np.asarray((self.likely[list(columns)] * scale) ** -2.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,16 +91,6 @@ class Evidence:
     box_px: int
     kernel: Matrix
     templates: dict[str, float] = field(default_factory=dict)
-
-    def columns_of(self, effect: str) -> dict[str, int]:
-        """The column of each parameter of an effect, by the parameter's name.
-
-        An effect that is fitted for each pointing may have fewer or more columns than parameters; a column or parameter
-        without a partner is left out.
-        """
-        (found,) = (one for one in self.effects if one.name == effect)
-        names = (parameter.name for parameter in found.parameters)
-        return dict(zip(names, self.columns[effect], strict=False))
 
     @cached_property
     def prior(self) -> Prior:
@@ -135,11 +118,6 @@ class Evidence:
         """The number of columns."""
         return self.discs[0].jacobian.shape[0]
 
-    @property
-    def of_effects(self) -> range:
-        """The columns after the base. For a full refit, these belong to the effects of that refit."""
-        return range(len(self.base), self.size)
-
 
 def gather(
     solution: Solution,
@@ -153,53 +131,7 @@ def gather(
     Raises DataError "bad-effects" if an added effect fails.
     """
     view = view or View(solution)
-    changes, columns, untestable = _changes(view, library)
     base = tuple(range(solution.inversion.coordinates.size))
-    columns = {name: tuple(c + len(base) for c in here) for name, here in columns.items()}
-    unocculted = unocculted_blocks(view, len(base) + len(changes), progress)
-    part = set(solution.part)
-    discs, distances = [], []
-    count = len(solution.transit.frames)
-    far = _Distance(view)
-    for n in range(count):
-        progress("effects", n, count)
-        if n in part:
-            discs.append(disc_with_jacobian(view, n, changes))
-            distances.append(far.of(view, n))
-        else:
-            distances.append(float("nan"))
-        for k, change in enumerate(changes):
-            if change.unocculted:
-                unocculted.errors[len(base) + k, n] = blocks(change.change(n, view.pointing_means))
-    found = Evidence(
-        effects=tuple(effect for effect in library if effect.name in columns),
-        columns=columns,
-        base=base,
-        discs=tuple(discs),
-        unocculted=unocculted,
-        image_info=tuple(
-            _image_info(frame, place, distance)
-            for frame, place, distance in zip(
-                solution.transit.frames, solution.sky.found, distances, strict=True
-            )
-        ),
-        untestable=untestable,
-        box_px=box_px(solution.transit.shape),
-        kernel=coarse_kernel(view.kernel, box_px(solution.transit.shape)),
-        templates={
-            effect.name: effect.distinguished(view) if effect.distinguished else float(effect.trials)
-            for effect in library
-            if effect.name in columns
-        },
-    )
-    return _testable(found)
-
-
-def _changes(
-    view: View, library: Sequence[Effect]
-) -> tuple[list[Change], dict[str, tuple[int, ...]], dict[str, str]]:
-    """Three results: the changes by all testable effects, in one list; for each of these effects, the indices of its
-    changes in the list; for each other effect, the reason why it cannot be tested."""
     changes: list[Change] = []
     columns: dict[str, tuple[int, ...]] = {}
     untestable: dict[str, str] = {}
@@ -208,10 +140,64 @@ def _changes(
         if reason is not None:
             untestable[effect.name] = reason
             continue
-        first = len(changes)
+        first = len(base) + len(changes)
         changes.extend(effect.changes(view))
-        columns[effect.name] = tuple(range(first, len(changes)))
-    return changes, columns, untestable
+        columns[effect.name] = tuple(range(first, len(base) + len(changes)))
+    unocculted = unocculted_blocks(view, len(base) + len(changes), progress)
+    part, frames = set(solution.part), solution.transit.frames
+    discs, infos = [], []
+    moved = _moved_outwards(view)
+    for n, (frame, seen) in enumerate(zip(frames, solution.sky.found, strict=True)):
+        progress("effects", n, len(frames))
+        info = ImageInfo(
+            file=frame.file,
+            pointing=frame.pointing,
+            x_px=seen.place.x_px,
+            y_px=seen.place.y_px,
+            time_s=frame.time_s,
+            exposure_s=frame.exposure_s,
+            gain_mode=frame.gain_mode,
+            described=seen.neighbours > 0 and seen.chi2_per_pixel < UNDESCRIBED,
+        )
+        if n in part:
+            discs.append(disc_with_jacobian(view, n, changes))
+            dark = solution.sky.dark[n]
+            far = moved.field(moved.convolve(view.occulted_scene(n)))[dark].mean()
+            light = max(float(view.expected[n][dark].mean()), 1e-9)
+            info = replace(info, scattering_distance_px=float(far / light))
+        infos.append(info)
+        for k, change in enumerate(changes, len(base)):
+            if change.unocculted:
+                unocculted.errors[k, n] = blocks(change.change(n, view.pointing_means))
+    for name, here in list(columns.items()):
+        cells = max(float(np.abs(disc.jacobian[list(here)]).max(initial=0.0)) for disc in discs)
+        # The Sun has no template.
+        if here and not (cells > 0 or np.abs(unocculted.errors[list(here)]).max() > 0):
+            untestable[name] = "it changes no image of this transit"
+            del columns[name]
+    effects = tuple(effect for effect in library if effect.name in columns)
+    return Evidence(
+        effects=effects,
+        columns=columns,
+        base=base,
+        discs=tuple(discs),
+        unocculted=unocculted,
+        image_info=tuple(infos),
+        untestable=untestable,
+        box_px=box_px(solution.transit.shape),
+        kernel=coarse_kernel(view.kernel, box_px(solution.transit.shape)),
+        templates={
+            effect.name: effect.distinguished(view) if effect.distinguished else float(effect.trials)
+            for effect in effects
+        },
+    )
+
+
+def _moved_outwards(view: View) -> Blur:
+    """The convolution with the PSF times the distance r: the mean r from which light scatters, times this light."""
+    d = np.arange(view.kernel.shape[0]) - view.kernel.shape[0] // 2
+    weighted = view.kernel * np.hypot(d[:, None], d[None, :])
+    return Blur(weighted, view.solution.transit.shape, threads=view.solution.threads)
 
 
 def disc_with_jacobian(view: View, n: int, changes: Sequence[Change]) -> DiscCells:
@@ -277,50 +263,3 @@ def _disc_at(view: View, disc: DiscCells, kept: Sequence[int], changes: Sequence
         expected=cells.weights @ expected,
         jacobian=jacobian,
     )
-
-
-class _Distance:
-    """The mean distance r from which light scatters into a disc, weighted with the light that comes from each
-    distance."""
-
-    def __init__(self, view: View) -> None:
-        kernel, solution = view.kernel, view.solution
-        d = np.arange(kernel.shape[0]) - kernel.shape[0] // 2
-        weighted = kernel * np.hypot(d[:, None], d[None, :])
-        self._blur = Blur(weighted, solution.transit.shape, threads=solution.threads)
-
-    def of(self, view: View, n: int) -> float:
-        """The mean distance for image n, px."""
-        solution = view.solution
-        dark = solution.sky.dark[n]
-        scene = view.occulted_scene(n)
-        there = self._blur.field(self._blur.convolve(scene))[dark].mean()
-        return float(there / max(float(view.expected[n][dark].mean()), 1e-9))
-
-
-def _image_info(frame: Frame, found: FoundPlace, distance_px: float) -> ImageInfo:
-    return ImageInfo(
-        file=frame.file,
-        pointing=frame.pointing,
-        x_px=found.place.x_px,
-        y_px=found.place.y_px,
-        time_s=frame.time_s,
-        exposure_s=frame.exposure_s,
-        gain_mode=frame.gain_mode,
-        scattering_distance_px=distance_px,
-        described=found.neighbours > 0 and found.chi2_per_pixel < UNDESCRIBED,
-    )
-
-
-def _testable(evidence: Evidence) -> Evidence:
-    """Remove the effects that change neither a disc nor a block, and list them as untestable."""
-    untestable, columns = dict(evidence.untestable), dict(evidence.columns)
-    for name, here in evidence.columns.items():
-        if not here:  # the Sun has no template
-            continue
-        cells = max(float(np.abs(disc.jacobian[list(here)]).max()) for disc in evidence.discs)
-        if not (cells > 0 or np.abs(evidence.unocculted.errors[list(here)]).max() > 0):
-            untestable[name] = "it changes no image of this transit"
-            del columns[name]
-    effects = tuple(effect for effect in evidence.effects if effect.name in columns)
-    return replace(evidence, effects=effects, columns=columns, untestable=untestable)

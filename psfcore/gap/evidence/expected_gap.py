@@ -49,8 +49,7 @@ def simulated(view: View, seed: int) -> Transit:
     for n, frame in enumerate(transit.frames):
         scene = view.pointing_scene(n) * view.uncovered(n)
         seen = optics.field(optics.convolve(optics.lanes(scene.astype(np.float32)))).astype(np.float64)
-        rng = np.random.default_rng([seed, n])
-        pixels = transit.noise.observe(seen, frame.exposure_s, rng)
+        pixels = transit.noise.observe(seen, frame.exposure_s, np.random.default_rng([seed, n]))
         frames.append(replace(frame, pixels=pixels.astype(np.float32)))
     return replace(transit, frames=tuple(frames))
 

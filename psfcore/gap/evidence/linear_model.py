@@ -32,14 +32,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from psfcore.arrays import scaled_inverse
-from psfcore.gap.evidence.cells import DiscCells, whitening
+from psfcore.gap.evidence.cells import whitening
 from psfcore.gap.evidence.evidence import Evidence
-
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
+from psfcore.gap.view import Matrix, Vector
 
 FLOOR = 0.003  # f of Eq. (2)
 UNLIKELY = 10.0  # width of the prior of a parameter, in units of its likely size
@@ -86,14 +83,12 @@ class LinearModel:
     @cached_property
     def discs(self) -> tuple[Whitened, ...]:
         """Every disc scaled to unit noise."""
-        return tuple(self._whitened(disc) for disc in self.evidence.discs)
-
-    def _whitened(self, disc: DiscCells) -> Whitened:
-        covariance = disc.covariance * self.disc_scale + self.floor**2 * np.outer(
-            disc.expected, disc.expected
-        )
-        white = whitening(covariance)
-        return Whitened(disc.index, white @ disc.residual, disc.jacobian @ white, white)
+        out = []
+        for disc in self.evidence.discs:
+            floor = self.floor**2 * np.outer(disc.expected, disc.expected)
+            white = whitening(disc.covariance * self.disc_scale + floor)
+            out.append(Whitened(disc.index, white @ disc.residual, disc.jacobian @ white, white))
+        return tuple(out)
 
     def equations(self, images: Sequence[int] | None = None) -> tuple[Matrix, Vector]:
         """The normal matrix and the right-hand side (`score`) of all columns. images: the images to use; None: all.
@@ -102,27 +97,22 @@ class LinearModel:
         """
         key = None if images is None else tuple(images)
         if key not in self._equations:
-            self._equations[key] = self._equations_of(images)
+            evidence, size = self.evidence, self.evidence.size
+            of_blocks = evidence.all_unocculted
+            if images is not None:
+                of_blocks = evidence.unocculted.equations(range(size), images)
+            normal, score = np.zeros((size, size)), np.zeros(size)
+            for disc in self.discs:
+                if images is None or disc.index in images:
+                    normal += disc.jacobian @ disc.jacobian.T
+                    score += disc.jacobian @ disc.residual
+            scale = self.unocculted_scale
+            self._equations[key] = normal + of_blocks.normal / scale, score + of_blocks.score / scale
         return self._equations[key]
 
     @cached_property
     def _equations(self) -> dict[tuple[int, ...] | None, tuple[Matrix, Vector]]:
         return {}
-
-    def _equations_of(self, images: Sequence[int] | None) -> tuple[Matrix, Vector]:
-        size = self.evidence.size
-        normal, score = np.zeros((size, size)), np.zeros(size)
-        for disc in self.discs:
-            if images is None or disc.index in images:
-                normal += disc.jacobian @ disc.jacobian.T
-                score += disc.jacobian @ disc.residual
-        unocculted = self.evidence.all_unocculted
-        if images is not None:
-            unocculted = self.evidence.unocculted.equations(range(size), images)
-        return (
-            normal + unocculted.normal / self.unocculted_scale,
-            score + unocculted.score / self.unocculted_scale,
-        )
 
     def fit(self, columns: Sequence[int], equations: tuple[Matrix, Vector] | None = None) -> Step:
         """Fit the coordinates of the PSF and these columns. equations: a result of `equations` (None: for all images)."""
@@ -137,7 +127,7 @@ class LinearModel:
     def _prior(self) -> Vector:
         """1 / variance of the prior of each column; 0 for the coordinates of the PSF."""
         prior = self.evidence.prior
-        return prior.precision(range(self.evidence.size), np.where(prior.field, 1.0, UNLIKELY))
+        return np.asarray((prior.likely * np.where(prior.field, 1.0, UNLIKELY)) ** -2.0)
 
     def pull_of_prior(self, step: Step, taken_out: Vector) -> Vector:
         """How much smaller the fitted values become if the prior also applies to the amounts that were subtracted
@@ -180,7 +170,6 @@ class LinearModel:
 
     def left_unocculted(self, step: Step) -> float:
         """The chi2 of the unocculted blocks after a fit, divided by unocculted_scale."""
-        here, unocculted = list(step.columns), self.evidence.all_unocculted
-        theta = step.values
+        here, theta, unocculted = list(step.columns), step.values, self.evidence.all_unocculted
         fall = 2 * theta @ unocculted.score[here] - theta @ unocculted.normal[np.ix_(here, here)] @ theta
         return float(unocculted.chi2 - fall) / self.unocculted_scale

@@ -17,12 +17,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from psfcore.gap.view import Vector
 from psfcore.noise import Noise
 from psfcore.transit.transit import Frame, Transit
-
-Vector = NDArray[np.float64]
 
 BLOCK = 16  # edge of a block of h, in values of h: there is one value for 2 x 2 px of the image
 FREE_OF_DISC_PX = 20.0
@@ -37,13 +35,11 @@ class MeasuredNoise:
     """The noise that the images show.
 
     noise: photon gain and read noise from the fitted line. ratio: measured variance divided by stated variance, the
-    median over all blocks. blocks: the
-    number of blocks.
+    median over all blocks.
     """
 
     noise: Noise
     ratio: float
-    blocks: int
 
     @property
     def agrees(self) -> bool:
@@ -53,26 +49,21 @@ class MeasuredNoise:
 
 def measured_noise(transit: Transit) -> MeasuredNoise | None:
     """Measure the noise of a transit. None if too few consecutive images show the same scene, or if no line can be fitted."""
-    levels, variances = [], []
-    frames = transit.frames
-    for one, other in itertools.pairwise(frames):
-        if (one.pointing, one.gain_mode, one.exposure_s) == (
-            other.pointing,
-            other.gain_mode,
-            other.exposure_s,
-        ):
-            level, variance = _blocks(one, other)
-            levels.append(level)
-            variances.append(variance)
-    if not levels or sum(level.size for level in levels) < LEAST_BLOCKS:
+    seen = [
+        np.array(_blocks(one, other))
+        for one, other in itertools.pairwise(transit.frames)
+        if (one.pointing, one.gain_mode, one.exposure_s)
+        == (other.pointing, other.gain_mode, other.exposure_s)
+    ]
+    level, variance = np.concatenate([np.zeros((2, 0)), *seen], axis=1)
+    if level.size < LEAST_BLOCKS:
         return None
-    level, variance = np.concatenate(levels), np.concatenate(variances)
     stated = transit.noise.photon_gain_dn * np.maximum(level, 0) + transit.noise.read_noise_dn**2
     ratio = float(np.median(variance / stated))
     gain, read_variance = _line(level, variance)
     if gain <= 0 and read_variance <= 0:
         return None
-    return MeasuredNoise(Noise(max(gain, 0.0), math.sqrt(max(read_variance, 0.0))), ratio, level.size)
+    return MeasuredNoise(Noise(max(gain, 0.0), math.sqrt(max(read_variance, 0.0))), ratio)
 
 
 def _blocks(one: Frame, other: Frame) -> tuple[Vector, Vector]:
@@ -86,8 +77,7 @@ def _blocks(one: Frame, other: Frame) -> tuple[Vector, Vector]:
     rows, columns = (n // BLOCK for n in h.shape)
     h, level = (p[: rows * BLOCK, : columns * BLOCK].reshape(rows, BLOCK, columns, BLOCK) for p in (h, level))
     spread = NORMAL_MAD * np.median(np.abs(h), axis=(1, 3))
-    y = (np.arange(rows) * 2 + 1) * BLOCK
-    x = (np.arange(columns) * 2 + 1) * BLOCK
+    y, x = ((np.arange(n) * 2 + 1) * BLOCK for n in (rows, columns))
     away = np.ones((rows, columns), dtype=bool)
     for frame in (one, other):
         reach = frame.place.radius_px + FREE_OF_DISC_PX
@@ -106,8 +96,7 @@ def _line(level: Vector, variance: Vector) -> tuple[float, float]:
         weight = 1 / np.maximum(expected, 1e-12) ** 2
         mean_x, mean_y = (float((weight * v).sum() / weight.sum()) for v in (level, variance))
         spread = float((weight * (level - mean_x) ** 2).sum())
-        slope = float((weight * (level - mean_x) * variance).sum()) / spread if spread > 0 else 0.0
-        slope = max(slope, 0.0)
+        slope = max(float((weight * (level - mean_x) * variance).sum()) / spread if spread > 0 else 0.0, 0.0)
         intercept = max(mean_y - slope * mean_x, 0.0)
         expected = np.maximum(slope * level + intercept, 0.1 * float(np.median(variance)))
     return slope, intercept

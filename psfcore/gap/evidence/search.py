@@ -40,12 +40,9 @@ from psfcore.convolution.convolver import correlations
 from psfcore.gap.evidence.cells import cells_of, coarse_kernel, sensitivities, whitening
 from psfcore.gap.evidence.linear_model import FLOOR
 from psfcore.gap.evidence.unocculted_blocks import block_means
-from psfcore.gap.view import Field, View
+from psfcore.gap.view import Field, Matrix, Vector, View
 from psfcore.psf import crop_or_pad
 from psfcore.scatter.total_psf import Optics
-
-Plane = NDArray[np.float64]
-Vector = NDArray[np.float64]
 
 STEP_PX = 8
 FINE_PX = 2
@@ -94,7 +91,7 @@ class PlaceSearch:
             np.concatenate([residual, *(near.residual for near in self._near)]),
         )
 
-    def kernels(self, kernels: Sequence[Plane]) -> Vector:
+    def kernels(self, kernels: Sequence[Matrix]) -> Vector:
         """The gain, Eq. (2), of each change of the PSF: (kernels,).
 
         kernels: changes of the PSF [y, x], with the centre at n // 2. The search uses the means of the discs and, for light
@@ -102,17 +99,17 @@ class PlaceSearch:
         """
         return self._gain(self._of_discs(self._to_displacements, kernels), self._of_cells(kernels))
 
-    def wide_kernels(self, kernels: Sequence[Plane]) -> Vector:
+    def wide_kernels(self, kernels: Sequence[Matrix]) -> Vector:
         """As `kernels`, for smooth changes of the PSF that may reach across the field. It uses only the means of the discs, not their cells, and coarse pixels."""
         return self._gain(self._of_discs(self._to_far, [coarse_kernel(one, STEP_PX) for one in kernels]))
 
-    def _of_discs(self, to_displacements: NDArray[np.floating], kernels: Sequence[Plane]) -> Plane:
+    def _of_discs(self, to_displacements: NDArray[np.floating], kernels: Sequence[Matrix]) -> Matrix:
         """T of Eq. (3) for the means of the discs (discs, kernels)."""
         size, dtype = to_displacements.shape[1], to_displacements.dtype
         cropped = (crop_or_pad(kernel, size).astype(dtype) for kernel in kernels)
         return np.array([np.einsum("nyx,yx->n", to_displacements, kernel) for kernel in cropped], float).T
 
-    def _of_cells(self, kernels: Sequence[Plane]) -> Plane:
+    def _of_cells(self, kernels: Sequence[Matrix]) -> Matrix:
         """T of Eq. (3) for the cells of all discs (cells, kernels), in units of their noise."""
         return np.array([np.concatenate([near.of_kernel(one) for near in self._near]) for one in kernels]).T
 
@@ -124,38 +121,28 @@ class PlaceSearch:
         A copy is displaced by at least NEAREST_RADII times the radius of the disc. The search uses a coarse grid with one blur,
         then a fine grid around the best displacement with several blurs.
         """
-        at, gains = self._coarse_gains
+        copies = (gaussian_filter(self._expected[n], COARSE_BLUR_PX) for n in self._images)
+        both = zip(self._planes, copies, strict=True)
+        means = np.array([_at_displacements(q, block_means(copy, STEP_PX)) for q, copy in both])
+        along = (np.arange(means.shape[1]) - means.shape[1] // 2) * STEP_PX
+        at = np.stack(np.meshgrid(along, along), axis=-1)
+        far = np.hypot(at[..., 0], at[..., 1]) >= self._nearest_px
+        gains = self._gain(means[:, far], least=SEEN)
         best = int(np.argmax(gains))
-        dx, dy = at[best].tolist()
+        dx, dy = at[far][best].tolist()
         found = [(*self._fine_displacement(blur_px, dx, dy), blur_px) for blur_px in BLURS_PX]
         gain, at_x, at_y, blur_px = max(found)
         # The means alone tell displacements apart less well than the means and the cells do.
         sharper = max(gain / max(float(gains[best]), UNSEEN), 1.0)
-        copies = distinguished(gains * sharper) * distinguished(np.array([one[0] for one in found]))
-        return (blur_px, at_x, at_y), copies
-
-    @property
-    def _coarse_gains(self) -> tuple[NDArray[np.intp], Vector]:
-        """The displacements of the coarse grid (displacements, 2), x and y, px; and their gains (displacements,)."""
-        copies = (gaussian_filter(self._expected[n], COARSE_BLUR_PX) for n in self._images)
-        means = np.array(
-            [
-                _at_displacements(q, block_means(copy, STEP_PX))
-                for q, copy in zip(self._planes, copies, strict=True)
-            ]
-        )
-        along = (np.arange(means.shape[1]) - means.shape[1] // 2) * STEP_PX
-        at = np.stack(np.meshgrid(along, along), axis=-1)
-        far = np.hypot(at[..., 0], at[..., 1]) >= self._nearest_px
-        return at[far], self._gain(means[:, far], least=SEEN)
+        apart = distinguished(gains * sharper) * distinguished(np.array([one[0] for one in found]))
+        return (blur_px, at_x, at_y), apart
 
     def _fine_displacement(self, blur_px: float, dx: int, dy: int) -> tuple[float, int, int]:
         """The best gain and its displacement (x, y), among displacements within one coarse step of (dx, dy).
 
         The grid has a step of FINE_PX, and the gain contains the means and the cells of the discs.
         """
-        reach = STEP_PX // FINE_PX
-        means, cells = [], []
+        reach, means, cells = STEP_PX // FINE_PX, [], []
         for n, q, near in zip(self._images, self._fine, self._near, strict=True):
             copy = gaussian_filter(self._expected[n], blur_px)
             coarse = block_means(copy, FINE_PX)
@@ -167,7 +154,7 @@ class PlaceSearch:
         row, column = np.divmod(best, 2 * reach + 1)
         return float(gain[best]), dx + (int(column) - reach) * FINE_PX, dy + (int(row) - reach) * FINE_PX
 
-    def _gain(self, means: Plane, cells: Plane | None = None, *, least: float = 0.0) -> Vector:
+    def _gain(self, means: Matrix, cells: Matrix | None = None, *, least: float = 0.0) -> Vector:
         """Eq. (2) for several templates (templates,).
 
         means: T of the means of the discs (discs, templates). cells: T of the cells (cells, templates), in units of the noise;
@@ -201,11 +188,11 @@ class _Unabsorbed:
     absorbed: the responses to the coordinates of the PSF (n, coordinates). residual: (n,).
     """
 
-    def __init__(self, absorbed: Plane, residual: Vector) -> None:
+    def __init__(self, absorbed: Matrix, residual: Vector) -> None:
         self._absorbed = np.linalg.qr(absorbed)[0]
         self.residual: Vector = self.of(residual)
 
-    def of(self, responses: Plane) -> Plane:
+    def of(self, responses: Matrix) -> Matrix:
         """The component of the responses (n, templates) that a change of the PSF cannot absorb."""
         return np.asarray(responses - self._absorbed @ (self._absorbed.T @ responses))
 
@@ -228,7 +215,7 @@ class NearDisc:
     residual: Vector
     to_displacements: NDArray[np.floating]
 
-    def of_kernel(self, change: Plane) -> Vector:
+    def of_kernel(self, change: Matrix) -> Vector:
         """The response of each cell to a change of the PSF, T of Eq. (3), (cells,).
 
         change: the change of the PSF [y, x], with the centre at [n // 2, n // 2].
@@ -236,19 +223,19 @@ class NearDisc:
         near = crop_or_pad(change, 2 * NEAR_REACH_PX + 1).astype(np.float32)
         return np.asarray(np.tensordot(self.to_displacements, near, axes=2), dtype=np.float64)
 
-    def of_copies(self, image: Field, dx: int, dy: int, reach_px: int) -> Plane:
+    def of_copies(self, image: Field, dx: int, dy: int, reach_px: int) -> Matrix:
         """The response of each cell to each copy of an image [y, x], T of Eq. (1): (cells, copies y, copies x).
 
         The copies are displaced by (dx, dy) and up to reach_px more along each axis, in whole pixels.
         """
-        sums = _sums(self.planes, image, reach_px, self.top - dy, self.left - dx)
-        return np.asarray(sums, dtype=np.float64)
+        return np.asarray(
+            _sums(self.planes, image, reach_px, self.top - dy, self.left - dx), dtype=np.float64
+        )
 
 
 def near_discs(view: View, images: Sequence[int]) -> list[NearDisc]:
     """The patches around the discs of these images. All have the same size."""
-    solution = view.solution
-    shape, optics = solution.transit.shape, solution.optics
+    solution, shape = view.solution, view.solution.transit.shape
     radius_px = max(solution.sky.found[n].place.radius_px for n in solution.part)
     whole = 2 * math.ceil(radius_px + MARGIN_PX) + 1
     size = min(whole, shape[0]), min(whole, shape[1])
@@ -259,27 +246,22 @@ def near_discs(view: View, images: Sequence[int]) -> list[NearDisc]:
         place, (rows, columns) = solution.sky.found[n].place, solution.sky.dark[n]
         top = int(np.clip(round(place.y_px) - size[0] // 2, 0, shape[0] - size[0]))
         left = int(np.clip(round(place.x_px) - size[1] // 2, 0, shape[1] - size[1]))
-        cells = cells_of((rows, columns), place.x_px, place.y_px)
-        planes = sensitivities(small, (rows - top, columns - left), cells.weights)
+        weights = cells_of((rows, columns), place.x_px, place.y_px).weights
+        planes = sensitivities(small, (rows - top, columns - left), weights)
         frame = solution.transit.frames[n]
         observed = cut(frame.pixels, top, left, size).astype(np.float64)
         variance = solution.transit.noise.variance(observed, frame.exposure_s)
         flat = planes.reshape(planes.shape[0], -1).astype(np.float64)
         residual, expected = solution.residual(n)
-        white = _without((flat * variance.ravel()) @ flat.T, cells.weights @ expected)
+        white = whitening((flat * variance.ravel()) @ flat.T)
+        along = white @ (weights @ expected)  # the mean of the disc, which is removed
+        along /= max(float(np.linalg.norm(along)), 1e-300)
+        white = white - np.outer(along, along @ white)
         planes = (white @ flat).astype(np.float32).reshape(planes.shape)
-        scene = optics.field(view.occulted_scene(n))
+        scene = solution.optics.field(view.occulted_scene(n))
         to_displacements = _sums(planes, scene, NEAR_REACH_PX, top, left)
-        out.append(NearDisc(top, left, planes, white @ (cells.weights @ residual), to_displacements))
+        out.append(NearDisc(top, left, planes, white @ (weights @ residual), to_displacements))
     return out
-
-
-def _without(covariance: Plane, level: Vector) -> Plane:
-    """The matrix that whitens cells with this covariance and removes the component proportional to `level` (cells,)."""
-    white = whitening(covariance)
-    along = white @ level
-    along /= max(float(np.linalg.norm(along)), 1e-300)
-    return np.asarray(white - np.outer(along, along @ white))
 
 
 # --- planes and kernels -------------------------------------------------------------------------------------
@@ -298,7 +280,7 @@ def _sums(
     )
 
 
-def _at_displacements(plane: Plane, image: Plane) -> Plane:
+def _at_displacements(plane: Matrix, image: Matrix) -> Matrix:
     """Eq. (1) for one plane, at all displacements at which at least two of its rows or columns overlap with the image."""
     return np.asarray(_sums(plane[None], image, max(plane.shape) - 2)[0])
 

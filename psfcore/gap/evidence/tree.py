@@ -105,30 +105,33 @@ def fields_of(pointings: Sequence[int], *, exposures: bool, kinds: bool) -> list
     whether exposure times or gain modes differ."""
     found = []
     for operator in ("light", "gain", *(["offset"] if exposures else [])):
-        spots = () if operator == "offset" else (SPOT,)
-        found += [Field(f"{operator}_place", operator, "place", width) for width in (*spots, *WIDTHS)]
-        found += [Field(f"{operator}_time", operator, "time", width) for width in WIDTHS]
-        widths = WIDTHS[1:] if operator == "gain" else WIDTHS[2:]
-        found += [Field(f"{operator}_place_time", operator, "place_time", width) for width in widths]
-    for pointing in pointings:
-        if len(pointings) > 1:
-            found.append(Field("outside", "outside", "pointing", None, pointing))
-            found += [Field("light_pointing", "light", "pointing", width, pointing) for width in WIDTHS]
-    found.append(Field("outside", "outside", "pointings"))
-    if kinds:
-        found.append(Field("gain_kind", "gain", "kind"))
-    found += [
+        widths = {
+            "place": WIDTHS if operator == "offset" else (SPOT, *WIDTHS),
+            "time": WIDTHS,
+            "place_time": WIDTHS[1:] if operator == "gain" else WIDTHS[2:],
+        }
+        found += [
+            Field(f"{operator}_{how}", operator, how, one) for how, some in widths.items() for one in some
+        ]
+    for pointing in pointings if len(pointings) > 1 else ():
+        found.append(Field("outside", "outside", "pointing", None, pointing))
+        found += [Field("light_pointing", "light", "pointing", width, pointing) for width in WIDTHS]
+    return [
+        *found,
+        Field("outside", "outside", "pointings"),
+        *([Field("gain_kind", "gain", "kind")] if kinds else []),
         Field("psf", "kernel", "constant"),
         Field("psf_place", "tilted_kernel", "constant"),
         Field("psf_time", "ring", "time"),
         Field("psf_place_time", "tilted_kernel", "time"),
+        *(
+            Field(f"psf_{how}", "scatter", how, width)
+            for width in WIDTHS[1:]
+            for how in ("place", "place_time")
+        ),
+        Field("edge", "edge", "constant"),
+        Field("edge_time", "edge", "time", WIDTHS[-1]),
     ]
-    for width in WIDTHS[1:]:
-        found += [
-            Field("psf_place", "scatter", "place", width),
-            Field("psf_place_time", "scatter", "place_time", width),
-        ]
-    return [*found, Field("edge", "edge", "constant"), Field("edge_time", "edge", "time", WIDTHS[-1])]
 
 
 def family_of(effect: Effect) -> str:
@@ -138,5 +141,4 @@ def family_of(effect: Effect) -> str:
 
 def listed(observations: Iterable[str]) -> str:
     """Observations as text, each once."""
-    each = (part for one in observations for part in one.split(", or "))
-    return "; or ".join(dict.fromkeys(filter(None, each)))
+    return "; or ".join(dict.fromkeys(part for one in observations for part in one.split(", or ") if part))

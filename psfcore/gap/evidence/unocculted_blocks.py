@@ -21,12 +21,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.gap.view import View
-from psfcore.scatter.reconstruction import Progress, Solution
+from psfcore.gap.view import Matrix, Vector, View
+from psfcore.scatter.reconstruction import Progress
 from psfcore.transit.occulter import disc_distance
-
-Matrix = NDArray[np.float64]
-Vector = NDArray[np.float64]
 
 BLOCK_PX = 32
 # Number of blocks along the shorter side: small images get smaller blocks, large ones get larger blocks.
@@ -67,17 +64,12 @@ class UnoccultedBlocks:
         same kind."""
         if self.given_gain_width is not None:
             return self.given_gain_width
-        spread: list[float] = []
+        every, spread = self.equations((), width=WIDEST_GAIN).gains, list[float]()
         for kind in np.unique(self.kind[self.part]):
-            gains = self._gains[(self.kind == kind) & self.part]
+            gains = every[(self.kind == kind) & self.part]
             if gains.size >= LEAST_IMAGES:
                 spread.extend((gains - np.median(gains)) ** 2 * gains.size / (gains.size - 1))
         return max(float(np.sqrt(np.mean(spread))), LEAST_GAIN) if spread else WIDEST_GAIN
-
-    @cached_property
-    def _gains(self) -> Vector:
-        """g_n of each image, with a wide prior (images,)."""
-        return self.equations((), width=WIDEST_GAIN).gains
 
     @property
     def _weights(self) -> Matrix:
@@ -92,17 +84,15 @@ class UnoccultedBlocks:
 
         Scene and brightness are free parameters.
         """
-        chosen = np.flatnonzero(self.part)
-        if images is not None:
-            chosen = np.array([n for n in images if self.part[n]], dtype=int)
+        every = range(len(self.part)) if images is None else images
+        chosen = np.array([n for n in every if self.part[n]], dtype=int)
         size, count = len(columns), self.levels.shape[0]
         normal, score, chi2, freedom = np.zeros((size + count,) * 2), np.zeros(size + count), 0.0, 0
-        weights = self._weights
         for pointing in np.unique(self.pointing[chosen]):
             here = chosen[self.pointing[chosen] == pointing]
             if here.size < LEAST_IMAGES:
                 continue
-            weight = weights[here]
+            weight = self._weights[here]
             weight[:, (weight > 0).sum(axis=0) < LEAST_IMAGES] = 0.0
             total = np.maximum(weight.sum(axis=0), 1e-300)
             design = np.zeros((size + count, here.size, self.levels.shape[1]))
@@ -145,8 +135,7 @@ class UnoccultedBlocks:
             others = [k for k in fitted if self.pointing[k] == self.pointing[n] and self.part[k]]
             if not self.part[n] or len(others) < LEAST_IMAGES - 1:
                 continue
-            here = np.array(others)
-            weight = weights[here]
+            here, weight = np.array(others), weights[others]
             total = weight.sum(axis=0)
             use = self.free[n] & ((weight > 0).sum(axis=0) >= LEAST_IMAGES - 1)
             if not use.any():
@@ -201,41 +190,31 @@ def blocks(plane: NDArray[np.floating]) -> Vector:
     return block_means(plane, block_px((plane.shape[0], plane.shape[1]))).ravel()
 
 
-def not_compared(solution: Solution, n: int) -> NDArray[np.bool_]:
-    """Mask [y, x] of the pixels of image n that cannot be compared with other images.
-
-    These are the pixels in and around its disc, and filled pixels.
-    """
-    place, filled = solution.sky.found[n].place, solution.transit.frames[n].filled
-    near = disc_distance(solution.transit.shape, place) < place.radius_px + FREE_OF_DISC_PX
-    return near if filled is None else near | filled
-
-
 def unocculted_blocks(view: View, columns: int, progress: Progress) -> UnoccultedBlocks:
     """The blocks of all images. columns: the number of columns of `errors`. `errors` is zero; the caller fills it
     in."""
-    solution = view.solution
-    transit = solution.transit
+    transit, edge = view.solution.transit, block_px(view.solution.transit.shape)
     levels, variance, free, means = [], [], [], []
-    for n, frame in enumerate(transit.frames):
+    for n, (frame, seen) in enumerate(zip(transit.frames, view.solution.sky.found, strict=True)):
         progress("unocculted field", n, len(transit.frames))
         levels.append(blocks(view.unocculted[n]))
         means.append(blocks(view.pointing_means[n]))
-        pixels = block_px(transit.shape) ** 2
-        noise = transit.noise.variance(means[-1], frame.exposure_s) / pixels
+        noise = transit.noise.variance(means[-1], frame.exposure_s) / edge**2
         variance.append(noise + (FLOOR * levels[-1]) ** 2)
-        free.append(blocks(not_compared(solution, n).astype(np.float64)) == 0)
+        near = disc_distance(transit.shape, seen.place) < seen.place.radius_px + FREE_OF_DISC_PX
+        if frame.filled is not None:
+            near |= frame.filled
+        free.append(blocks(near.astype(np.float64)) == 0)
     kinds = [(f.pointing, f.gain_mode, f.exposure_s) for f in transit.frames]
     number = {kind: k for k, kind in enumerate(dict.fromkeys(kinds))}
-    shape = np.shape(levels)
     return UnoccultedBlocks(
         levels=np.array(levels),
         variance=np.array(variance),
         free=np.array(free),
         means=np.array(means),
-        errors=np.zeros((columns, *shape)),
+        errors=np.zeros((columns, *np.shape(levels))),
         pointing=np.array([f.pointing for f in transit.frames]),
         kind=np.array([number[kind] for kind in kinds]),
         part=np.ones(len(transit.frames), dtype=bool),
-        across=transit.shape[1] // block_px(transit.shape),
+        across=transit.shape[1] // edge,
     )

@@ -118,19 +118,17 @@ def draw_map(figure: Any, report: Report) -> None:
     these effects, on the same colour scale.
     """
     charts, rows = _panels(figure, has_after(report)), report["images"]
-    before = _column(rows, "residual_pct")
-    top = _scale(before, _column(rows, "noise_pct"))
-    x, y = _column(rows, "x_px"), _column(rows, "y_px")
+    x, y, before, noise = (_column(rows, name) for name in ("x_px", "y_px", "residual_pct", "noise_pct"))
+    top, drawn = _scale(before, noise), None
     ny, nx = report["shape"]
-    drawn = None
     for axes, values in zip(charts, (before, _column(rows, "residual_after_pct")), strict=False):
         for fov, (here, _, symbol) in _looks(rows).items():
             here = here & np.isfinite(values)
             style = {"marker": symbol, "s": 62, "edgecolors": "#444444", "linewidths": 0.6}
             drawn = axes.scatter(x[here], y[here], c=values[here], cmap=CHANGE, vmin=-top, vmax=top, **style)
             axes.plot([], [], symbol, color="#777777", ms=7, label=f"pointing {fov}")
-        axes.set(xlim=(-0.5, nx - 0.5), ylim=(-0.5, ny - 0.5), aspect="equal")
-        axes.set(xlabel="Detector x (px)", ylabel="Detector y (px)" if axes is charts[0] else "")
+        axes.set(xlim=(-0.5, nx - 0.5), ylim=(-0.5, ny - 0.5), aspect="equal", xlabel="Detector x (px)")
+    charts[0].set(ylabel="Detector y (px)")
     charts[0].legend(fontsize=8.5, loc="best", framealpha=0.85, edgecolor="none")
     figure.colorbar(drawn, ax=charts, label="Simulated - observed (%)", shrink=0.85)
     tidy(charts)
@@ -152,28 +150,25 @@ def field_of(report: Report) -> Report | None:
 
 def _draw_curve(figure: Any, report: Report, field: Report, label: str) -> None:
     at, values, sigma = field["curve"].values()
-    in_psf = "radius_px" in field["curve"]
+    along = ("Radius in the PSF (px)", "log") if "radius_px" in field["curve"] else ("Time (s)", "linear")
     axes = figure.subplots()
     axes.errorbar(at, values, sigma, fmt="o", ms=4, color=_ANSWER, ecolor=_OTHER)
     axes.axhline(0.0, color="#777777", lw=0.8)
-    axes.set(xlabel="Radius in the PSF (px)" if in_psf else "Time (s)", ylabel=label)
-    if in_psf:
-        axes.set_xscale("log")
+    axes.set(xlabel=along[0], ylabel=label, xscale=along[1])
     tidy([axes])
 
 
 def _draw_field(figure: Any, report: Report, field: Report, label: str) -> None:
     values, sigma = (np.array(field["map"][name]) for name in ("value", "sigma"))
-    charts = figure.subplots(1, 2)
+    charts, clearest = figure.subplots(1, 2), abs(field["strength"]["value"])
     ny, nx = report["shape"]
-    clearest = abs(field["strength"]["value"])
     seen = np.where(sigma < clearest, values, np.nan)  # elsewhere the prior decides, not the data
     for axes, plane, title, top, name in (
         (charts[0], seen, "The field, where its error is smaller", 1.2 * clearest, label),
         (charts[1], values / sigma, "The field divided by its error", 5.0, "sigma"),
     ):
-        style = {"extent": (-0.5, nx - 0.5, -0.5, ny - 0.5), "cmap": CHANGE, "vmin": -top, "vmax": top}
-        drawn = axes.imshow(plane, origin="lower", **style)
+        extent = (-0.5, nx - 0.5, -0.5, ny - 0.5)
+        drawn = axes.imshow(plane, origin="lower", extent=extent, cmap=CHANGE, vmin=-top, vmax=top)
         axes.set(title=title, xlabel="Detector x (px)", ylabel="Detector y (px)")
         axes.plot(*(_column(report["images"], name) for name in ("x_px", "y_px")), ".", color="#333333", ms=3)
         figure.colorbar(drawn, ax=axes, label=name, shrink=0.85)
@@ -195,20 +190,22 @@ def draw_cells(figure: Any, found: Diagnosis) -> None:
         for (low, high, sector, sectors), mean, error in zip(_CELLS, means, errors, strict=True):
             if not np.isfinite(mean):
                 continue
-            width = 360 / sectors
-            first = sector * width - width / 2
+            ends = (sector - 0.5) * 360 / sectors, (sector + 0.5) * 360 / sectors
             share = float(np.clip(mean / top, -1, 1))
-            style = {"fc": CHANGE((share + 1) / 2), "ec": "white", "lw": 1.0}
-            axes.add_patch(Wedge((0, 0), high, first, first + width, width=high - low, **style))
-            angle, middle = np.radians(sector * width), (low + high) / 2 if low else 0.0
+            colour = CHANGE((share + 1) / 2)
+            axes.add_patch(Wedge((0, 0), high, *ends, width=high - low, fc=colour, ec="white", lw=1.0))
+            angle, middle = np.radians(sector * 360 / sectors), (low + high) / 2 if low else 0.0
             style = {"color": "white" if abs(share) > _DARK else INK, "fontsize": 8, "linespacing": 1.05}
             place = middle * np.cos(angle), middle * np.sin(angle)
             axes.text(*place, f"{mean:+.1f}\n±{error:.1f}", ha="center", va="center", **style)
         axes.add_patch(Circle((0, 0), 1.0, fc="none", ec="#555555", lw=1.0))
-        axes.set(xlim=(-1.05, 1.05), ylim=(-1.05, 1.05), aspect="equal")
-        axes.set(xlabel="x from the centre (radii of the dark disc)")
-        for side in axes.spines.values():
-            side.set_visible(False)
+        axes.set(
+            xlim=(-1.05, 1.05),
+            ylim=(-1.05, 1.05),
+            aspect="equal",
+            xlabel="x from the centre (radii of the dark disc)",
+        )
+        axes.spines[:].set_visible(False)
     charts[0].set(ylabel="y from the centre (radii of the dark disc)")
 
 
@@ -239,11 +236,9 @@ def _scale(values: Vector, noise: Vector) -> float:
 
 def _numbers(disc: DiscCells) -> list[int]:
     """For each cell of a disc, its index in `_CELLS`. Cells with too few pixels are missing from the disc."""
-    out = []
-    for radius, azimuth in zip(disc.radius, disc.azimuth, strict=True):
-        ring = next(k for k, (_, high, _) in enumerate(RINGS) if radius < high or k == len(RINGS) - 1)
-        sectors = RINGS[ring][2]
-        first = sum(one[2] for one in RINGS[:ring])
+    out, ends = [], [high for _, high, _ in RINGS[:-1]]
+    for ring, azimuth in zip(np.searchsorted(ends, disc.radius, side="right"), disc.azimuth, strict=True):
+        sectors, first = RINGS[ring][2], sum(one[2] for one in RINGS[:ring])
         out.append(first + round(float(azimuth) / (2 * np.pi / sectors)) % sectors)
     return out
 
@@ -266,16 +261,15 @@ def slices_png(found: Diagnosis) -> bytes:
 
 def _draw_slices(figure: Any, found: Diagnosis) -> None:
     charts, n = _panels(figure, bool(found.corrected), sharey=True), largest_residual(found)
-    solution = found.solution
-    frame, place = solution.transit.frames[n], solution.sky.found[n].place
-    rows, columns = solution.sky.dark[n]
+    transit, sky = found.solution.transit, found.solution.sky
+    frame, centre, (rows, columns) = transit.frames[n], sky.found[n].place.x_px, sky.dark[n]
     # The centre of a disc at the edge of the field may be outside the field, but its dark pixels are inside.
-    middle, centre = int(np.median(rows)), place.x_px
+    middle = int(np.median(rows))
     band = slice(max(middle - SLICE_ROWS, 0), middle + SLICE_ROWS + 1)
     first, last = max(int(centre) - _SLICE_PX, 0), min(int(centre) + _SLICE_PX + 1, frame.pixels.shape[1])
     x = np.arange(first, last) - centre
     seen = frame.pixels[band, first:last].astype(np.float64)
-    noise = np.sqrt(solution.transit.noise.variance(seen, frame.exposure_s).sum(axis=0)) / seen.shape[0]
+    noise = np.sqrt(transit.noise.variance(seen, frame.exposure_s).sum(axis=0)) / seen.shape[0]
     inside = columns[rows == middle] - centre
     simulated = [
         simulated_of(found, n, with_answer=answer)[band, first:last].mean(axis=0)
@@ -288,11 +282,10 @@ def _draw_slices(figure: Any, found: Diagnosis) -> None:
     for axes, colour, line in zip(charts, (_BEFORE, _AFTER), simulated, strict=False):
         if inside.size:
             axes.axvspan(inside.min() - 0.5, inside.max() + 0.5, color="#eeeeee", linewidth=0, zorder=0)
-        style = {"fmt": "o", "color": _OBSERVED, "ms": 3.8, "elinewidth": 0.9}
-        axes.errorbar(x, observed, noise, label="observed", **style)
+        axes.errorbar(x, observed, noise, fmt="o", color=_OBSERVED, ms=3.8, elinewidth=0.9, label="observed")
         axes.plot(x, line, color=colour, linewidth=1.8, label="simulated")
         axes.set(xlim=(-_SLICE_PX, _SLICE_PX), ylim=(min(0.0, float(observed.min())) - 0.05 * top, top))
-        axes.set(xlabel="Offset from the occulter's centre along x (px)")
+        axes.set_xlabel("Offset from the occulter's centre along x (px)")
         axes.legend(fontsize=8.5, loc="upper center", framealpha=0.85, edgecolor="none", ncols=2)
     charts[0].set(ylabel="Intensity (DN/s)")
     tidy(charts)
@@ -357,14 +350,13 @@ def _looks(rows: Sequence[dict[str, Any]]) -> dict[int, tuple[NDArray[np.bool_],
 def draw_where(axes: Any, report: Report) -> None:
     """Draw one horizontal bar for each axis, with its p-value. The axes are in the order of the report; the first is at the top."""
     rows = report["where"]
-    at = np.arange(len(rows))[::-1]
-    shares = np.array([100 * row["share"] for row in rows])
+    at, shares = np.arange(len(rows))[::-1], np.array([100 * row["share"] for row in rows])
     colours = [_ANSWER if n == 0 and report["verdict"] != "none" else _OTHER for n in range(len(rows))]
-    axes.barh(at, shares, color=colours, height=0.7)
-    for y, share, row in zip(at, shares, rows, strict=True):
-        p = row["p_value"]
-        text = f"p < {CERTAIN_P:.0e}" if p < CERTAIN_P else f"p = {p:.2g}"
-        axes.annotate(text, (share, y), (4, 0), textcoords="offset points", va="center", fontsize=8.5)
+    bars = axes.barh(at, shares, color=colours, height=0.7)
+    numbers = [
+        f"= {row['p_value']:.2g}" if row["p_value"] >= CERTAIN_P else f"< {CERTAIN_P:.0e}" for row in rows
+    ]
+    axes.bar_label(bars, [f"p {number}" for number in numbers], padding=4, fontsize=8.5)
     axes.set_yticks(at, [row["axis"].replace("_", " ") for row in rows])
     axes.set(xlim=(0, 1.3 * max(float(shares.max(initial=0.0)), 1.0)), xlabel="Share of the gap (%)")
     tidy([axes])
@@ -373,21 +365,15 @@ def draw_where(axes: Any, report: Report) -> None:
 def draw_effects(axes: Any, report: Report) -> None:
     """Draw the closure by each effect, with its 90 % interval and its probability. The named or tied effects are blue."""
     rows = fits_of(report)[:MOST_EFFECTS]
-    at = np.arange(len(rows))[::-1]
-    names = []
-    for y, row in zip(at, rows, strict=True):
-        chosen = _chosen(row, report)
-        _draw_closure(axes, float(y), row["closure"], _ANSWER if chosen else _OTHER)
+    at, chosen = np.arange(len(rows))[::-1], [_chosen(row, report) for row in rows]
+    mark = {"attributed": "  (named)", "tie": "  (tied)"}.get(report["verdict"], "")
+    axes.set_yticks(at, [row["words"] + (mark if one else "") for row, one in zip(rows, chosen, strict=True)])
+    for y, row, is_one, tick in zip(at, rows, chosen, axes.get_yticklabels(), strict=True):
+        _draw_closure(axes, float(y), row["closure"], _ANSWER if is_one else _OTHER)
         axes.text(1.52, y, percent_words(row["probability"]), va="center", ha="right", fontsize=9)
-        mark = {"attributed": "named", "tie": "tied"}.get(report["verdict"], "") if chosen else ""
-        names.append(row["words"] + (f"  ({mark})" if mark else ""))
-    axes.text(
-        1.52, at.max(initial=0) + 0.75, "probability", va="center", ha="right", fontsize=9, color="#555555"
-    )
-    axes.set_yticks(at, names)
-    for tick, row in zip(axes.get_yticklabels(), rows, strict=True):
-        if _chosen(row, report):
-            tick.set_fontweight("bold")
+        tick.set_fontweight("bold" if is_one else "normal")
+    above = at.max(initial=0) + 0.75
+    axes.text(1.52, above, "probability", va="center", ha="right", fontsize=9, color="#555555")
     axes.axvline(0, color="#555555", linewidth=1.0)
     axes.axvline(1, color="#555555", linewidth=1.0, linestyle=(0, (4, 3)))
     axes.set(xlim=(_NO_CLOSURE, 1.56), ylim=(-0.7, len(rows) + 0.2), xticks=(0, 0.25, 0.5, 0.75, 1.0))

@@ -45,15 +45,13 @@ AXIS_WORDS = {
 
 def gap_report(found: Diagnosis) -> dict[str, Any]:
     """The report of a diagnosis, schema gap/3."""
-    answer, stated = found.answer, found.limits.as_json()
-    lines = three_lines(found)
-    several = found.told is not None and not (
-        len(found.told.names) == 1 and found.told.names[0] in found.fits
-    )
+    answer, stated, lines = found.answer, found.limits.as_json(), three_lines(found)
+    several = found.told is not None and found.told.label not in found.fits
+    where, which, how_far = (line.partition(": ")[2] for line in lines)
     return {
         "schema": SCHEMA,
         "lines": lines,
-        "sentence": _sentence(lines),
+        "sentence": f"{where[0].upper()}{where[1:]} Cause: {which} {how_far[0].upper()}{how_far[1:]}",
         "gap": {
             "before_refit_pct": found.before_refit.to_json(),
             "rms_pct": found.rms.to_json(),
@@ -69,7 +67,10 @@ def gap_report(found: Diagnosis) -> dict[str, Any]:
         "closure": found.shrinking_of_told and _interval(found.shrinking_of_told.closure),
         "would_separate": would_separate(found),
         "hypotheses": [
-            {"causes": [_label(*label) for label in sorted(labels, key=str)], "probability": share}
+            {
+                "causes": [{"family": one, "effect": effect} for one, effect in sorted(labels, key=str)],
+                "probability": share,
+            }
             for labels, share in answer.hypotheses.items()
             if share >= LEAST_SHARE
         ],
@@ -98,16 +99,6 @@ def gap_report(found: Diagnosis) -> dict[str, Any]:
     }
 
 
-def _sentence(lines: Sequence[str]) -> str:
-    """The three lines as sentences."""
-    where, which, how_far = (line.partition(": ")[2] for line in lines)
-    return f"{where[0].upper()}{where[1:]} Cause: {which} {how_far[0].upper()}{how_far[1:]}"
-
-
-def _label(family: str, effect: str | None) -> dict[str, Any]:
-    return {"family": family, "effect": effect}
-
-
 def _probabilities(found: Diagnosis) -> dict[str, float]:
     """The probability that each effect acts, and each other form of a family."""
     return {
@@ -128,7 +119,8 @@ def _cause(found: Diagnosis, cause: Cause) -> dict[str, Any]:
         "alternatives": [
             {
                 "stage": one.stage,
-                **_label(one.family.name, one.effect),
+                "family": one.family.name,
+                "effect": one.effect,
                 "probability": one.probability,
                 "words": one.words,
             }
@@ -274,13 +266,11 @@ def _nowhere(found: Diagnosis) -> str:
 
 
 def _nothing(found: Diagnosis) -> str:
-    likeliest = next(iter(found.answer.labels), None)
-    hint = (
-        ""
-        if likeliest is None
-        else f"; the most probable cause is {label_words(*likeliest)} ({percent_words(found.answer.labels[likeliest])})"
-    )
-    return f"no cause; the probability of none is {percent_words(found.answer.none)}{hint}."
+    likeliest = [
+        f"; the most probable cause is {label_words(*label)} ({percent_words(share)})"
+        for label, share in list(found.answer.labels.items())[:1]
+    ]
+    return f"no cause; the probability of none is {percent_words(found.answer.none)}{''.join(likeliest)}."
 
 
 def _weaker(found: Diagnosis) -> str:
@@ -307,17 +297,14 @@ def _where(found: Diagnosis) -> str:
     axes = [axis for axis in found.where if axis.p_value <= SIGNIFICANT and axis.share >= LEAST_SHARE_OF_AXIS]
     axes = sorted(axes, key=lambda axis: -axis.share)[:MOST_AXES]
     told = ", ".join(f"{AXIS_WORDS[axis.name]} ({100 * axis.share:.0f} %)" for axis in axes)
-    place = next((_place(found.shapes[f]) for f in _told_families(found) if f in found.shapes), "")
+    families = (cause.alternatives[0].family.name for cause in found.answer.causes)
+    place = next((_place(found.shapes[one]) for one in families if one in found.shapes), "")
     varies = f"; it varies {told}" if told else "" if place else "; it varies along no single axis"
     numbers = axes[0].at.get("pointings", []) if axes else []
     largest = (
         f", and is largest in pointing{'s' if len(numbers) > 1 else ''} {' and '.join(map(str, numbers))}"
     )
     return f"{lead}{varies}{largest if numbers and told else ''}{place}."
-
-
-def _told_families(found: Diagnosis) -> list[str]:
-    return [cause.alternatives[0].family.name for cause in found.answer.causes]
 
 
 def _place(shape: FieldShape) -> str:
@@ -356,23 +343,19 @@ def _which(found: Diagnosis) -> str:
 
 def _numbers(found: Diagnosis, cause: Cause) -> str:
     """The fitted parameters of the first alternative, as text; empty if it has none, or too many."""
-    name, told = cause.alternatives[0].effect, found.corrected or found.told
-    if name is None or name == SUN or told is None:
+    name = cause.alternatives[0].effect
+    if name is None or name == SUN or found.told is None:
         return ""
     own = {
         label.removeprefix(f"{name}."): value
-        for label, value in told.values.items()
-        if len(_names(found)) == 1 or label.startswith(f"{name}.")
+        for label, value in (found.corrected or found.told).values.items()
+        if len(found.told.names) == 1 or label.startswith(f"{name}.")
     }
     if not own or len(own) > MOST_READ:
         return ""
     return ", ".join(
         f"{words(label)} {v:.3g} ± {sigma:.2g} {unit}".strip() for label, (v, sigma, unit) in own.items()
     )
-
-
-def _names(found: Diagnosis) -> tuple[str, ...]:
-    return () if found.told is None else found.told.names
 
 
 def _how_far(found: Diagnosis) -> str:
@@ -422,7 +405,8 @@ def cause_words(cause: Cause, numbers: str = "") -> str:
     shown = []
     for k, one in enumerate(cause.alternatives):
         own = f"{numbers}; " if numbers and k == 0 else ""
-        shown.append(f"{_alternative_words(one)} ({own}{percent_words(one.probability)})")
+        form = f"{one.family.words}, in a form that the library does not have"
+        shown.append(f"{words(one.effect) if one.effect else form} ({own}{percent_words(one.probability)})")
     *first, last = shown
     told = f"{', '.join(first)} or {last}" if first else last
     if cause.level == "stage":
@@ -430,23 +414,13 @@ def cause_words(cause: Cause, numbers: str = "") -> str:
     return told
 
 
-def _alternative_words(one: Alternative) -> str:
-    return (
-        f"{one.family.words}, in a form that the library does not have"
-        if one.effect is None
-        else words(one.effect)
-    )
-
-
 def shown_by_blocks(found: Diagnosis) -> bool:
     """Whether the blocks of the unocculted field show a gap, but the discs and their cells do not."""
     model = found.model
-    if found.rms.value >= found.noise_pct:
-        return False
     cells, blocks = left_chi2(model, model.base)
-    freedom = sum(disc.residual.size for disc in model.discs)
-    free_blocks = model.evidence.all_unocculted.independent
-    return bool(chdtrc(freedom, cells) > VISIBLE_P > chdtrc(free_blocks, max(blocks, 0.0)))
+    p_discs = chdtrc(sum(disc.residual.size for disc in model.discs), cells)
+    p_blocks = chdtrc(model.evidence.all_unocculted.independent, max(blocks, 0.0))
+    return bool(found.rms.value < found.noise_pct and p_discs > VISIBLE_P > p_blocks)
 
 
 def p_words(p_value: float) -> str:

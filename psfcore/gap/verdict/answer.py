@@ -31,9 +31,9 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections import defaultdict
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, TypeVar
 
@@ -125,9 +125,10 @@ class Cause:
 class Answer:
     """The answer of a diagnosis.
 
-    causes: the first cause, and those that act beside it; empty if no gap is detected. verdict, named: as in the table above. none: the
-    probability of no cause. hypotheses: the probability of each set of labels, the most probable first. best: the variants of the most
-    probable hypothesis with a cause, and its Sun. closed: the closed form with the final noise. level: the probability of a group.
+    causes: the first cause, and those that act beside it; empty if no gap is detected. verdict, named: as in the table
+    above. none: the probability of no cause. hypotheses: of each set of labels, the most probable first.
+    variants, evidence: the best variant of each form, and the ln E of each form alone. closed: the closed form with the
+    final noise. level: the probability of a group.
     """
 
     causes: tuple[Cause, ...]
@@ -136,24 +137,19 @@ class Answer:
     none: float
     hypotheses: Mapping[Labels, float]
     variants: Mapping[Form, Variant | None]
-    best: Hypothesis
     closed: ClosedForm
     level: float
-    evidence: Mapping[Form, float] = field(default_factory=dict)
+    evidence: Mapping[Form, float]
 
     @cached_property
     def labels(self) -> dict[Label, float]:
         """The probability that each label acts, the most probable first."""
         return _sorted(_of_labels(self.hypotheses))
 
-    def form(self, label: Label) -> Form:
-        """The most probable form of a label."""
-        own = [form for form in self.evidence if label_of(form) == label]
-        return max(own, key=lambda form: self.evidence[form])
-
     def variant(self, label: Label) -> Variant | None:
         """The best variant of the most probable form of a label; None for the Sun."""
-        return self.variants[self.form(label)]
+        own = [form for form in self.evidence if label_of(form) == label]
+        return self.variants[max(own, key=lambda form: self.evidence[form])]
 
 
 def label_of(form: Form) -> Label:
@@ -165,8 +161,7 @@ def answer_of(model: LinearModel, level: float) -> Answer:
     """The answer for a linear model. level: the probability of a group of alternatives."""
     weighed = _Weighed(ClosedForm(model))
     best = weighed.best
-    own = [weighed.variants[form] for form in best]
-    exact = [one for one in own if one is not None]
+    exact = weighed.variants_of(best)
     if exact:
         values, _ = weighed.closed.fitted(exact, weighed.sun_of(best))
         columns = np.concatenate([one.columns for one in exact])
@@ -176,30 +171,23 @@ def answer_of(model: LinearModel, level: float) -> Answer:
             del weighed  # its matrices, before those of the next closed form are made
             weighed = _Weighed(ClosedForm(model, fields, inexact=inexact))
             best = weighed.best
-    left = weighed.closed.chi2_left(
-        [v for v in (weighed.variants[form] for form in best) if v is not None], weighed.sun_of(best)
-    )
+    left = weighed.closed.chi2_left(weighed.variants_of(best), weighed.sun_of(best))
     if max(left) > 1:
         weighed.closed.misfit = (max(left[0], 1.0), max(left[1], 1.0))
         weighed = _Weighed(weighed.closed)
     weighed.closed.forget_suns()
     shares = weighed.probabilities()
-    none = shares.get((), 0.0)
     by_label = _sum((frozenset(map(label_of, forms)), share) for forms, share in shares.items())
     causes = causes_of(by_label, level)
-    verdict, named = verdict_of(causes, len(model.evidence.discs))
-    acting = max((forms for forms in shares if forms), key=lambda forms: shares[forms])
     return Answer(
         causes,
-        verdict,
-        named,
-        none,
-        _sorted(by_label),
-        weighed.variants,
-        acting,
-        weighed.closed,
-        level,
-        weighed.alone,
+        *verdict_of(causes, len(model.evidence.discs)),
+        none=shares.get((), 0.0),
+        hypotheses=_sorted(by_label),
+        variants=weighed.variants,
+        closed=weighed.closed,
+        level=level,
+        evidence=weighed.alone,
     )
 
 
@@ -207,6 +195,7 @@ class _Weighed:
     """ln E of every hypothesis of a closed form.
 
     alone: of each form. variants: the best variant of each form. together: of two or three forms, in their best variants.
+    The forms of every key have the order of `in_order`, so a part of a key is a key as well.
     """
 
     def __init__(self, closed: ClosedForm) -> None:
@@ -221,13 +210,21 @@ class _Weighed:
             *[form for form in order if form.effect is not None][:OF_LIBRARY],
             *(next(form for form in order if form.family == family) for family in families),
         ]
-        self._short = list(dict.fromkeys(short))
-        rank = {form: k for k, form in enumerate(order)}
+        self._short = dict.fromkeys(short)
         self.together: dict[Hypothesis, float] = {}
         for pair in itertools.combinations(self._short, 2):
-            if min(rank[form] for form in pair) < FIRST_OF_PAIR and _may_act_together(*pair):
-                self.together[pair] = self._of(pair)
+            if set(pair).intersection(order[:FIRST_OF_PAIR]) and _may_act_together(*pair):
+                suns: Sequence[Sun | None] = SUNS if any(form.is_sun for form in pair) else (None,)
+                self.together[pair] = float(closed.together(self.variants_of(pair), suns)[0])
         self._add_triples()
+
+    def in_order(self, *forms: Form) -> Hypothesis:
+        """The hypothesis that these forms act together: in the order in which they were chosen to be weighed."""
+        return tuple(form for form in self._short if form in forms)
+
+    def variants_of(self, forms: Hypothesis) -> list[Variant]:
+        """The best variants of the forms of a hypothesis, without the Sun, which has none."""
+        return [one for one in (self.variants[form] for form in forms) if one is not None]
 
     def _add_triples(self) -> None:
         """Two forms and the Sun: for the best pairs, if the Sun is in one of them or beside them."""
@@ -235,24 +232,16 @@ class _Weighed:
         if sun is None:
             return
         order = sorted(self.together, key=lambda pair: -self.together[pair])[:TRIPLES]
-        beside = {form for pair in order if sun in pair for form in pair if form is not sun}
-        pairs = {pair for pair in order if sun not in pair}
+        beside = [form for pair in order if sun in pair for form in pair if form is not sun]
+        pairs = dict.fromkeys(pair for pair in order if sun not in pair)
         for one, other in itertools.product(beside, self._short):
-            if other is not sun and _may_act_together(one, other) and (other, one) not in pairs:
-                pairs.add((one, other))
-        if not pairs:
-            return
+            if other is not sun and _may_act_together(one, other):
+                pairs[self.in_order(one, other)] = None
         leading = self.sun_of(next((pair for pair in order if sun in pair), (sun,)))
         for pair in pairs:
             # One of the Suns has nearly all of the probability, so the mean over them is its share.
-            variants = [one for one in (self.variants[form] for form in pair) if one is not None]
-            value = float(self.closed.together(variants, [leading])[0]) - math.log(len(SUNS))
-            self.together[(*pair, sun)] = value
-
-    def _of(self, forms: Hypothesis) -> float:
-        variants = [one for one in (self.variants[form] for form in forms) if one is not None]
-        suns: Sequence[Sun | None] = SUNS if len(variants) < len(forms) else (None,)
-        return float(self.closed.together(variants, suns)[0])
+            value = float(self.closed.together(self.variants_of(pair), [leading])[0]) - math.log(len(SUNS))
+            self.together[self.in_order(*pair, sun)] = value
 
     @property
     def best(self) -> Hypothesis:
@@ -267,7 +256,7 @@ class _Weighed:
         """The most probable Sun of a hypothesis; None if the Sun does not act in it."""
         if not any(form.is_sun for form in forms):
             return None
-        variants = [one for one in (self.variants[form] for form in forms) if one is not None]
+        variants = self.variants_of(forms)
         return max(SUNS, key=lambda sun: float(self.closed.together(variants, [sun])[0]))
 
     def probabilities(self) -> dict[Hypothesis, float]:
@@ -277,9 +266,9 @@ class _Weighed:
         for form, value in self.alone.items():
             weights[(form,)] = math.log(ONE * prior[form]) + value
         for forms, value in self.together.items():
-            own = forms[:2]
-            more = math.log(AND_SUN) if len(forms) > len(own) else 0.0
-            weights[forms] = math.log(2 * TWO * prior[own[0]] * prior[own[1]]) + more + value
+            one, other, *_ = sorted(forms, key=lambda form: len(forms) > 2 and form.is_sun)
+            more = math.log(AND_SUN) if len(forms) > 2 else 0.0
+            weights[forms] = math.log(2 * TWO * prior[one] * prior[other]) + more + value
         sun = next((form for form in self.alone if form.is_sun), None)
         coherent = dict(weights)
         if sun is not None:
@@ -306,12 +295,8 @@ def _may_act_together(one: Form, other: Form) -> bool:
 def prior_of(forms: Sequence[Form]) -> dict[Form, float]:
     """The prior probability of each form, if one cause acts."""
     families = {form.family for form in forms}
-    out = {}
-    for form in forms:
-        mates = [other for other in forms if other.family == form.family]
-        alike = [other for other in mates if (other.field is None) == (form.field is None)]
-        out[form] = 0.5 / len(alike) / len(families)
-    return out
+    alike = Counter((form.family, form.field is None) for form in forms)
+    return {form: 0.5 / alike[form.family, form.field is None] / len(families) for form in forms}
 
 
 def _normalised(weights: Mapping[Hypothesis, float]) -> dict[Hypothesis, float]:
@@ -344,11 +329,8 @@ def _sorted(shares: Mapping[Key, float]) -> dict[Key, float]:
 
 
 def _of_labels(shares: Mapping[Labels, float]) -> dict[Label, float]:
-    out: dict[Label, float] = defaultdict(float)
-    for labels, share in shares.items():
-        for label in sorted(labels, key=str):  # equally probable labels have the same order in every process
-            out[label] += share
-    return dict(out)
+    # Equally probable labels have the same order in every process.
+    return _sum((label, share) for labels, share in shares.items() for label in sorted(labels, key=str))
 
 
 def causes_of(shares: Mapping[Labels, float], level: float) -> tuple[Cause, ...]:
@@ -357,15 +339,16 @@ def causes_of(shares: Mapping[Labels, float], level: float) -> tuple[Cause, ...]
     if none * (1 + FLOOR) > 1:
         return ()
     some = {labels: share / (1 - none) for labels, share in _settled(shares).items() if labels}
-    whole, found = _of_labels(some), list[Cause]()
-    rest = some
+    whole, found, rest = _of_labels(some), list[Cause](), some
     for number, least in enumerate((0.0, *FURTHER), 1):
         if sum(share for labels, share in some.items() if len(labels) >= number) < least:
             break
         group = smallest_group(rest, level)
         if not group:
             break
-        found.append(Cause(tuple(_alternative(label, whole[label]) for label in group)))
+        found.append(
+            Cause(tuple(Alternative(FAMILIES[one[0]], one[1], min(whole[one], 1.0)) for one in group))
+        )
         rest = _sum(
             (labels - {next((x for x in group if x in labels), None)}, share)
             for labels, share in rest.items()
@@ -403,11 +386,6 @@ def _settled(shares: Mapping[Labels, float]) -> dict[Labels, float]:
     return _sum(
         (frozenset(becomes.get(label, label) for label in labels), share) for labels, share in shares.items()
     )
-
-
-def _alternative(label: Label, share: float) -> Alternative:
-    family, effect = label
-    return Alternative(FAMILIES[family], effect, min(share, 1.0))
 
 
 def verdict_of(causes: Collection[Cause], images: int) -> tuple[Verdict, tuple[str, ...]]:

@@ -31,16 +31,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from psfcore.gap.evidence.linear_model import LinearModel
+from psfcore.gap.view import Vector
 from psfcore.transit.transit import Fold, folds
-
-Vector = NDArray[np.float64]
 
 RESAMPLES = 1000
 # Relative error of an effect's template; chi2_after contains its square times the chi2 of the gap. In a blind set of 120 cases (seed 36),
@@ -89,10 +87,8 @@ class HeldOut:
     def of(self, images: Sequence[int]) -> HeldOut:
         """The results for these images only. Deviance and spread are left out, because they belong to folds."""
         here = [self.images.index(image) for image in images]
-        arrays = {
-            one.name: getattr(self, one.name)[here]
-            for one in fields(self)
-            if isinstance(getattr(self, one.name), np.ndarray)
+        arrays: dict[str, Any] = {
+            name: values[here] for name, values in vars(self).items() if isinstance(values, np.ndarray)
         }
         return HeldOut(tuple(images), **arrays)
 
@@ -118,13 +114,11 @@ def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold])
 
     columns: the parameters of effects that are fitted together with the PSF (columns of the Jacobian).
     """
-    evidence = model.evidence
+    evidence, base = model.evidence, len(model.evidence.base)
     by_index = {disc.index: k for k, disc in enumerate(evidence.discs)}
-    rows: list[tuple[float, ...]] = []
-    images: list[int] = []
+    rows, images = list[tuple[float, ...]](), list[int]()
     deviance: dict[tuple[int, ...], float] = {}
     spread: dict[tuple[int, ...], tuple[Vector, Vector]] = {}
-    base = len(evidence.base)
     # A prior constrains the parameters of a random field.
     free = base + sum(not evidence.prior.field[column] for column in columns)
     unocculted_noise = math.sqrt(model.unocculted_scale)
@@ -134,8 +128,7 @@ def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold])
         if len(fitted) <= free or not held:
             continue
         step = model.fit(columns, model.equations(fitted))
-        here = list(step.columns)
-        in_discs, in_blocks = [], []
+        here, in_discs, in_blocks = list(step.columns), [], []
         for n in held:
             disc, white = evidence.discs[by_index[n]], model.discs[by_index[n]]
             left = white.residual - white.jacobian[here].T @ step.values
@@ -155,7 +148,8 @@ def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold])
         residuals, jacobians = (
             np.concatenate(parts, axis=-1) for parts in zip(*in_discs, *in_blocks, strict=True)
         )
-        along = _along_errors(jacobians, step.covariance)
+        variances, ways = np.linalg.eigh(step.covariance)
+        along = (np.sqrt(np.maximum(variances, 0.0))[:, None] * ways.T) @ jacobians
         cells = sum(left.size for left, _ in in_discs)
         deviance[tuple(held)] = _deviance(residuals, along)
         spread[tuple(held)] = _spread(along[:, :cells]), _spread(along)
@@ -172,23 +166,17 @@ def _error(jacobian: Vector, covariance: Vector) -> float:
     return float(np.einsum("ki,kl,li->", jacobian, covariance, jacobian))
 
 
-def _along_errors(jacobian: Vector, covariance: Vector) -> Vector:
-    """The change (parameters, n) by one standard deviation of each independent error of the parameters.
-
-    jacobian: (parameters, n), in units of the noise. covariance: of the parameters.
-    """
-    values, vectors = np.linalg.eigh(covariance)
-    return np.asarray((np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T) @ jacobian)
-
-
 def _spread(along: Vector) -> Vector:
     """The eigenvalues of J Cov J^T (parameters,): the chi2 that errors of the parameters add is the sum of these times
-    squares of standard normal variables. along: as from `_along_errors`."""
+    squares of standard normal variables.
+
+    along: (parameters, n), the change by one standard deviation of each independent error, in units of the noise.
+    """
     return np.maximum(np.linalg.eigvalsh(along @ along.T), 0.0)
 
 
 def _deviance(left: Vector, along: Vector) -> float:
-    """Eq. (4). left: residuals (n,) in units of the noise. along: as from `_along_errors`."""
+    """Eq. (4). left: residuals (n,) in units of the noise. along: as for `_spread`."""
     inner = np.eye(along.shape[0]) + along @ along.T
     projected = along @ left
     return float(left @ left - projected @ np.linalg.solve(inner, projected) + np.linalg.slogdet(inner)[1])
@@ -199,8 +187,7 @@ def closure(
 ) -> Interval | None:
     """Eq. (1) with its 90 % interval; None if there is no gap. scale_error: relative error of the scale of chi2 (noise variance)."""
     # A fold is skipped if it has too few images for the number of fitted parameters, so the images can differ.
-    common = sorted(set(before.images) & set(after.images))
-    spread = list(after.spread.values())
+    common, spread = sorted(set(before.images) & set(after.images)), after.spread.values()
     before, after = before.of(common), after.of(common)
     chi2_before, chi2_after, nu, nu_after = before.chi2, after.chi2, before.expected, after.expected
     shown = float((before.unocculted_chi2 - before.unocculted_expected).sum())

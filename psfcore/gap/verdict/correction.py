@@ -23,12 +23,10 @@ from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.effect_fits import EffectFit, fit_effects, label_of, left_chi2
 from psfcore.gap.evidence.evidence import Evidence, gather, residuals_at
 from psfcore.gap.evidence.linear_model import LinearModel
-from psfcore.gap.view import View, return_unused_memory
+from psfcore.gap.view import Vector, View, return_unused_memory
 from psfcore.scatter.inversion import invert, solution_at
 from psfcore.scatter.reconstruction import Progress, Solution
 from psfcore.transit.transit import Transit
-
-Vector = NDArray[np.float64]
 
 ROUNDS = 6
 SETTLED = 0.3  # the rounds end when the remaining step is less than this fraction of the errors, rms
@@ -106,13 +104,17 @@ def add_to_model(
     transit, shape = solution.transit, solution.inversion.shape
     # An effect that searches for a position keeps the position that it found first.
     view = view or View(solution)
-    held = [_acting(hold(effect, view), found, len(effects)) for effect in effects]
+    held = []
+    for effect in effects:
+        still = effect if effect.held is None else effect.held(view)
+        labels = [p.name if len(effects) == 1 else f"{still.name}.{p.name}" for p in still.parameters]
+        held.append(_with_part(still, [k for k, label in enumerate(labels) if label in found.values]))
     wanted = np.array([value for value, _, _ in found.values.values()])
     base = len(model.evidence.base)
     here, at, theta = view, solution.inversion.coordinates, np.zeros(wanted.size)
-    move = found.step.values[:base]
-    least, settled = np.inf, False
-    taken: _Round | None = None
+    move, least, settled = found.step.values[:base], np.inf, False
+    # The accepted round: its solution (not its view, which keeps many planes), what was subtracted, and its number.
+    taken: tuple[Solution, Vector, int] | None = None
     for rounds in range(1, 1 + ROUNDS):
         try:
             share = min(1.0, LONGEST / max(shape.length(move), 1e-9))
@@ -121,12 +123,12 @@ def add_to_model(
             fit = solution_at(images, solution.total, at, threads=solution.threads, progress=progress)
             here = View(fit)
             return_unused_memory()  # the planes of the view before
-            seen = _fit_remaining(_with_old_jacobian(model, here, held), held, theta)
+            left, wanted = _fit_remaining(_with_old_jacobian(model, here, held), held, theta)
         except DataError:
             if taken is None:
                 raise
             break  # the step was too long: the fit failed, or the images no longer constrain the effect
-        wanted, move = seen.theta, seen.left.step.values[:base]
+        move = left.step.values[:base]
         # A parameter that must be positive is dropped if its fitted value is not positive.
         positive = np.array([parameter.positive for effect in held for parameter in effect.parameters])
         acts = ~(positive & (wanted <= 0))
@@ -135,68 +137,43 @@ def add_to_model(
             theta, wanted = theta[acts], wanted[acts]
             taken, least = None, np.inf
             continue
-        left_over = float(left_chi2(seen.model, seen.left.step).sum())
-        if left_over > least + max(
-            WORSE, WORSE_SHARE * found.gain
-        ):  # the effect is too strong for first-order steps
+        left_over = float(left_chi2(left.model, left.step).sum())
+        # The effect is too strong for first-order steps.
+        if left_over > least + max(WORSE, WORSE_SHARE * found.gain):
             break
-        least = min(least, left_over)
-        taken = _Round(here.solution, theta, rounds)
-        steps = np.append(move, wanted - theta)
-        settled = float(np.sqrt(np.mean((steps / np.maximum(seen.sigmas, 1e-300)) ** 2))) < SETTLED
+        least, taken = min(least, left_over), (here.solution, theta, rounds)
+        sigmas = np.maximum(np.sqrt(np.diag(left.step.covariance)), 1e-300)
+        settled = float(np.sqrt(np.mean((np.append(move, wanted - theta) / sigmas) ** 2))) < SETTLED
         if settled:
             break
     assert taken is not None
+    fit, theta, rounds = taken
     del here  # its planes, before those of another view are made
     return_unused_memory()
     if settled:  # the steps weigh cells; the PSF is fitted to pixels, as without effects
-        images, threads = taken.solution.transit, solution.threads
-        fit = invert(images, shape, start=at, near=True, threads=threads, progress=progress)
-        taken = replace(taken, solution=fit)
-    return _corrected(taken, held, model, progress)
-
-
-@dataclass(frozen=True, eq=False)
-class _Round:
-    """An accepted round. theta: the parameters that were subtracted from the images. rounds: its number, from 1.
-
-    A view keeps many planes for each image, so the round keeps only the solution.
-    """
-
-    solution: Solution
-    theta: Vector
-    rounds: int
-
-
-def _corrected(
-    taken: _Round,
-    held: Sequence[Effect],
-    model: LinearModel,
-    progress: Progress,
-) -> Corrected:
-    """The refit after its last round, with the Jacobian computed there."""
-    evidence = gather(taken.solution, held, progress=progress)
-    own = replace(model, evidence=_with_noise_of(model.evidence, evidence))
-    seen = _fit_remaining(own, held, taken.theta)
-    fitted = zip(seen.left.values.items(), seen.theta, strict=True)
+        fit = invert(fit.transit, shape, start=at, near=True, threads=solution.threads, progress=progress)
+    evidence = _with_noise_of(model.evidence, gather(fit, held, progress=progress))
+    left, values = _fit_remaining(replace(model, evidence=evidence), held, theta)
+    fitted = zip(left.values.items(), values, strict=True)
     return Corrected(
         effects=tuple(held),
-        solution=taken.solution,
-        model=own,
+        solution=fit,
+        model=left.model,
         values={name: (float(value), sigma, unit) for (name, (_, sigma, unit)), value in fitted},
-        rounds=taken.rounds,
+        rounds=rounds,
     )
 
 
 def _with_old_jacobian(model: LinearModel, view: View, held: Sequence[Effect]) -> LinearModel:
     """The linear model at another PSF: its residuals and its Jacobian of the PSF, with the Jacobian of the effects and the noise of `model`."""
-    before = model.evidence
-    base, kept = len(before.base), list[int]()
-    columns: dict[str, tuple[int, ...]] = {}
+    before, first = model.evidence, len(model.evidence.base)
+    every = {effect.name: effect.parameters for effect in before.effects}
+    kept, columns = list[int](), dict[str, tuple[int, ...]]()
     for effect in held:
-        at = before.columns_of(effect.name)
-        own = [at[parameter.name] for parameter in effect.parameters if parameter.name in at]
-        columns[effect.name] = tuple(range(base + len(kept), base + len(kept) + len(own)))
+        names = {parameter.name for parameter in effect.parameters}
+        pairs = zip(every[effect.name], before.columns[effect.name], strict=False)
+        own = [column for parameter, column in pairs if parameter.name in names]
+        columns[effect.name] = tuple(range(first + len(kept), first + len(kept) + len(own)))
         kept += own
     changes = [change for effect in held for change in effect.changes(view)]
     evidence = residuals_at(view, before, kept, changes)
@@ -204,28 +181,10 @@ def _with_old_jacobian(model: LinearModel, view: View, held: Sequence[Effect]) -
     return replace(model, evidence=_with_noise_of(before, evidence))
 
 
-@dataclass(frozen=True, eq=False)
-class _Remaining:
-    """A fit to images from which a part of the effects was subtracted.
+def _fit_remaining(model: LinearModel, held: Sequence[Effect], out: Vector) -> tuple[EffectFit, Vector]:
+    """The fit of effects to images from which a part of them was subtracted; and the parameters: both parts together.
 
-    model: the linear model at this fit. left: the linear fit of the remaining part of the effects. theta: the
-    parameters: the subtracted part plus the remaining part.
-    """
-
-    model: LinearModel
-    left: EffectFit
-    theta: Vector
-
-    @property
-    def sigmas(self) -> Vector:
-        """Errors of the coordinates of the PSF, then of theta."""
-        return np.sqrt(np.diag(self.left.step.covariance))
-
-
-def _fit_remaining(model: LinearModel, held: Sequence[Effect], out: Vector) -> _Remaining:
-    """Fit the effects to images from which these effects were already subtracted.
-
-    model: the linear model of these images. out: the current parameters.
+    model: the linear model of these images. out: the part that was subtracted.
     """
     left = fit_effects(model, model.evidence.effects, any_sign=True)
     found = np.array([value for value, _, _ in left.values.values()])
@@ -236,9 +195,8 @@ def _fit_remaining(model: LinearModel, held: Sequence[Effect], out: Vector) -> _
             f"was subtracted; the images constrain {found.size} of them: they may not contain this effect",
         )
     base = len(model.evidence.base)
-    out_already = np.concatenate([np.zeros(base), out])
-    found -= model.pull_of_prior(left.step, out_already)[base:]
-    return _Remaining(model, left, out + found)
+    found -= model.pull_of_prior(left.step, np.concatenate([np.zeros(base), out]))[base:]
+    return left, out + found
 
 
 def _those_that_act(effects: Sequence[Effect], acts: NDArray[np.bool_]) -> list[Effect]:
@@ -246,11 +204,9 @@ def _those_that_act(effects: Sequence[Effect], acts: NDArray[np.bool_]) -> list[
 
     Raises DataError "effect-unseen" if an effect keeps no parameter.
     """
-    out, first = [], 0
+    out, left = [], iter(acts)
     for effect in effects:
-        count = len(effect.parameters)
-        part = [k for k in range(count) if acts[first + k]]
-        first += count
+        part = [k for k in range(len(effect.parameters)) if next(left)]
         if not part:
             raise DataError(
                 "effect-unseen",
@@ -258,11 +214,6 @@ def _those_that_act(effects: Sequence[Effect], acts: NDArray[np.bool_]) -> list[
             )
         out.append(_with_part(effect, part))
     return out
-
-
-def hold(effect: Effect, view: View) -> Effect:
-    """The effect without its search: the result of the search, for example a position, is fixed for these images."""
-    return effect if effect.held is None else effect.held(view)
 
 
 def _with_noise_of(before: Evidence, after: Evidence) -> Evidence:
@@ -274,25 +225,16 @@ def _with_noise_of(before: Evidence, after: Evidence) -> Evidence:
     were = {disc.index: disc for disc in before.discs}
     discs = []
     for disc in after.discs:
-        was = were.get(disc.index)
-        if was is not None:
-            same = was.covariance.shape == disc.covariance.shape
-            disc = replace(
-                disc, covariance=was.covariance if same else disc.covariance, level_before=was.level
-            )
-        discs.append(disc)
+        was = were.get(disc.index, disc)
+        kept = was if was.covariance.shape == disc.covariance.shape else disc
+        discs.append(replace(disc, covariance=kept.covariance, level_before=was.level))
     return replace(
         after, discs=tuple(discs), unocculted=replace(after.unocculted, variance=before.unocculted.variance)
     )
 
 
-def _acting(effect: Effect, found: EffectFit, effects: int) -> Effect:
-    """The effect with only the parameters that the fit `found` contains. effects: the number of effects in the fit."""
-    labels = [p.name if effects == 1 else f"{effect.name}.{p.name}" for p in effect.parameters]
-    return _with_part(effect, [k for k, label in enumerate(labels) if label in found.values])
-
-
 def _with_part(effect: Effect, part: Sequence[int]) -> Effect:
+    """The effect with only these of its parameters."""
     if len(part) == len(effect.parameters):
         return effect
     return replace(

@@ -26,7 +26,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import logsumexp, ndtr, ndtri
 
@@ -34,9 +33,6 @@ from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.closed_form import ClosedForm, Form, Variant
 from psfcore.gap.evidence.tree import listed
 from psfcore.gap.verdict.answer import FLOOR, NONE, ONE, prior_of
-
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
 
 FOUND, EXCLUDED = 0.9, 0.95
 ALIKE = 3.0  # in sigma: a difference of chi2 of 9
@@ -81,10 +77,9 @@ class EffectLimits:
         """
 
         def multiple(one: ParameterLimits) -> float:
-            return math.inf if one.found_90 is None else one.found_90 / one.likely
+            return math.inf if one.found_90 is None else max(one.found_90 / one.likely, 1.0)
 
-        first = next((one for one in self.parameters if multiple(one) <= 1), None)
-        return first or min(self.parameters, key=multiple)
+        return min(self.parameters, key=multiple)
 
     def as_json(self, *, observed: bool = True) -> dict[str, Any]:
         """The limits of the leading parameter. If the effect has several parameters, the limits of all parameters are added."""
@@ -102,10 +97,6 @@ class Alike:
     distance: float
     would_separate: str
 
-    def as_json(self) -> dict[str, Any]:
-        """The pair for a report."""
-        return {"pair": list(self.pair), "distance": self.distance, "would_separate": self.would_separate}
-
 
 @dataclass(frozen=True)
 class Limits:
@@ -122,20 +113,18 @@ class Limits:
 
     def after_refit(self, effect: Effect, fitted: Mapping[str, tuple[float, float]]) -> Limits:
         """The same limits, with excluded_95 of an effect from a full refit. fitted: value and error by parameter."""
-        positive = {parameter.name: parameter.positive for parameter in effect.parameters}
-        parameters = tuple(
-            replace(one, excluded_95=upper_limit(*fitted[one.name], positive[one.name]))
-            if one.name in fitted
-            else one
-            for one in self.effects[effect.name].parameters
-        )
-        return replace(self, effects={**self.effects, effect.name: EffectLimits(parameters)})
+        new = {
+            p.name: upper_limit(*fitted[p.name], p.positive) for p in effect.parameters if p.name in fitted
+        }
+        parameters = self.effects[effect.name].parameters
+        own = EffectLimits(tuple(replace(p, excluded_95=new.get(p.name, p.excluded_95)) for p in parameters))
+        return replace(self, effects={**self.effects, effect.name: own})
 
     def as_json(self, *, observed: bool = True) -> dict[str, Any]:
         """`limits`, `alike` and `untestable` as in a report. observed: as in `ParameterLimits`."""
         return {
             "limits": {name: one.as_json(observed=observed) for name, one in self.effects.items()},
-            "alike": [one.as_json() for one in self.alike],
+            "alike": [vars(one) | {"pair": list(one.pair)} for one in self.alike],
             "untestable": [{"name": name, "why": why} for name, why in self.untestable.items()],
         }
 
@@ -156,15 +145,13 @@ def limits(closed: ClosedForm, beside: Sequence[Variant] = (), *, observed: bool
         least = math.log(FLOOR * NONE / (ONE * prior[form]))
         rows = []
         for k in [None] if effect.field else range(form.columns.size):
-            found = _found(closed, form, k, least)
-            excluded = None
+            one, excluded = effect.parameters[k or 0], None
             if observed:
                 others = [one for one in beside if one.form is not form]
                 excluded = _excluded_rms(closed, form) if k is None else _excluded(closed, form, k, others)
-            one = effect.parameters[k or 0]
-            rows.append(
-                ParameterLimits(RMS if k is None else one.name, one.unit, one.likely, found, excluded)
-            )
+            found = _found(closed, form, k, least)
+            name = RMS if k is None else one.name
+            rows.append(ParameterLimits(name, one.unit, one.likely, found, excluded))
         effects[effect.name] = EffectLimits(tuple(rows))
     distances = _distances(closed, {name: own[name] for name in effects}, effects)
     alike = (
@@ -183,23 +170,16 @@ def _found(closed: ClosedForm, form: Form, k: int | None, least: float) -> float
     rng = np.random.default_rng(SEED)
     noise = (vectors * np.sqrt(np.maximum(values, 0.0))) @ rng.standard_normal((values.size, DRAWS))
     if k is None:
-        change = normal @ (
-            rng.standard_normal((values.size, DRAWS)) * (form.likely / form.likely[0])[:, None]
-        )
-        seen = float(np.diag(normal).mean())
+        drawn = rng.standard_normal((values.size, DRAWS)) * (form.likely / form.likely[0])[:, None]
+        change, seen = normal @ drawn, float(np.diag(normal).mean())
     else:
         change, seen = normal[:, k : k + 1], float(normal[k, k])
     weights = []
     for variant in form.variants:
         inner = normal[np.ix_(variant.part, variant.part)] * np.outer(variant.width, variant.width)
         lower = np.linalg.cholesky(np.eye(variant.part.size) + inner)
-        weights.append(
-            (
-                np.linalg.inv(lower) * variant.width,
-                float(np.log(np.diag(lower)).sum()) + variant.cost,
-                variant.part,
-            )
-        )
+        cost = float(np.log(np.diag(lower)).sum()) + variant.cost
+        weights.append((np.linalg.inv(lower) * variant.width, cost, variant.part))
 
     def margin(strength: float) -> float:
         score = strength * change + noise
@@ -261,18 +241,14 @@ def _distance(closed: ClosedForm, true: Form, fitted: Form, at: EffectLimits) ->
     leading = at.leading
     if leading.found_90 is None:
         return None
-    columns = np.concatenate([true.columns, fitted.columns])
-    normal, own = closed.normal(columns), slice(true.columns.size, None)
+    normal = closed.normal(np.concatenate([true.columns, fitted.columns]))
+    here, own = slice(0, true.columns.size), slice(true.columns.size, None)
     if leading.name == RMS:  # the mean over its coefficients
-        covariance = np.diag((leading.found_90 * true.likely / true.likely[0]) ** 2)
+        size = leading.found_90 * true.likely / true.likely[0]
     else:
-        k = at.parameters.index(leading)
-        covariance = np.zeros((true.columns.size,) * 2)
-        covariance[k, k] = leading.found_90**2
-    here = slice(0, true.columns.size)
-    across = normal[own, here]
-    width = fitted.likely * fitted.scales[-1]
-    inner = np.linalg.inv(normal[own, own] + np.diag(width**-2.0))
+        size = leading.found_90 * (np.arange(true.columns.size) == at.parameters.index(leading))
+    across, covariance = normal[own, here], np.diag(size**2)
+    inner = np.linalg.inv(normal[own, own] + np.diag((fitted.likely * fitted.scales[-1]) ** -2.0))
     left = np.sum((normal[here, here] - across.T @ inner @ across) * covariance)
     return math.sqrt(max(float(left), 0.0))
 

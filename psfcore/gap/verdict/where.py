@@ -20,15 +20,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from psfcore.gap.evidence.cells import DiscCells
 from psfcore.gap.evidence.evidence import Evidence, ImageInfo
 from psfcore.gap.evidence.linear_model import LinearModel, Step
-
-Matrix = NDArray[np.float64]
-Vector = NDArray[np.float64]
+from psfcore.gap.view import Matrix, Vector
 
 SIGN_FLIPS = 999
 AS_GOOD = 0.3  # an axis of the best effect comes first if it explains at least this fraction of what the best axis explains
@@ -75,10 +72,9 @@ def where(
     the residuals.
     """
     designs = _designs(model.evidence)
-    spans, columns = {}, 0
+    names, spans, columns = list(designs), {}, 0
     for name, patterns in designs.items():
         spans[name] = list(range(columns, columns := columns + patterns[0].shape[0]))
-    names = list(designs)
     design, absorbed = _of_cells(model, designs)
     normal = design @ design.T
 
@@ -88,8 +84,11 @@ def where(
         return np.asarray(residual - absorbed @ (absorbed.T @ residual))
 
     residual = left([one.residual for one in model.discs])
-    score = (design @ residual)[None]
-    seen = score if explained is None else (design @ left(_explained(model, explained)))[None]
+    seen = score = (design @ residual)[None]
+    if explained is not None:
+        base = len(model.evidence.base)
+        here, values = list(explained.columns[base:]), explained.values[base:]
+        seen = (design @ left([disc.jacobian[here].T @ values for disc in model.discs]))[None]
     in_blocks, score_of_blocks = _of_unocculted(model, designs)
     subset = {}
     for chosen in itertools.chain(*(itertools.combinations(names, size) for size in range(len(names) + 1))):
@@ -109,11 +108,7 @@ def where(
         share = max(shares[name], 0.0) / total
         axes.append(Axis(name, share, p_value, subset[(name,)], _at(model, name)))
     best = max((axis.alone for axis in axes), default=0.0)
-
-    def rank(axis: Axis) -> tuple[bool, float]:
-        return axis.p_value > SIGNIFICANT, -axis.share
-
-    axes.sort(key=rank)
+    axes.sort(key=lambda axis: (axis.p_value > SIGNIFICANT, -axis.share))
     leading = [axis for axis in axes if axis.name in favoured and axis.alone >= AS_GOOD * best]
     others = [axis for axis in axes if axis not in leading]
     if leading and leading[0] != axes[0]:
@@ -170,30 +165,18 @@ def _kinds(values: Vector) -> Matrix | None:
 
     Returns an array (values - 1, images); None if all images have the same value.
     """
-    kinds = np.unique(values)
-    if kinds.size < 2:
-        return None
-    return np.array([(values == kind) - np.mean(values == kind) for kind in kinds[1:]])
+    rows = [(values == kind) - np.mean(values == kind) for kind in np.unique(values)[1:]]
+    return np.array(rows) if rows else None
 
 
 def _of_cells(model: LinearModel, designs: dict[str, list[Matrix]]) -> tuple[Matrix, Matrix]:
     """Two results for the whitened cells of all discs: the patterns of the axes (patterns, cells), without the component
     that a change of the PSF can absorb; and an orthonormal basis of this component (cells, coordinates)."""
-    base = list(model.evidence.base)
-    rows = [
-        np.vstack([patterns[k] for patterns in designs.values()]) @ disc.white
-        for k, disc in enumerate(model.discs)
-    ]
+    base, each = list(model.evidence.base), enumerate(model.discs)
+    rows = [np.vstack([patterns[k] for patterns in designs.values()]) @ disc.white for k, disc in each]
     design = np.hstack(rows)
     absorbed = np.linalg.qr(np.hstack([disc.jacobian[base] for disc in model.discs]).T)[0]
     return design - (design @ absorbed) @ absorbed.T, absorbed
-
-
-def _explained(model: LinearModel, step: Step) -> list[Vector]:
-    """For each disc: the residuals of its cells that the fitted effects predict."""
-    base = len(model.evidence.base)
-    here, values = list(step.columns[base:]), step.values[base:]
-    return [disc.jacobian[here].T @ values for disc in model.discs]
 
 
 def _of_unocculted(model: LinearModel, designs: dict[str, list[Matrix]]) -> tuple[Matrix, Matrix]:
@@ -234,33 +217,25 @@ def _falls(normal: Matrix, scores: Matrix, columns: list[int]) -> Vector:
 
 def shapley(names: list[str], worth: dict[tuple[str, ...], float]) -> dict[str, float]:
     """The Shapley value of each name. worth: the decrease of chi2 by each subset of the names."""
-    count = len(names)
     out = dict.fromkeys(names, 0.0)
     for chosen, value in worth.items():
-        for name in names:
-            if name in chosen:
-                continue
-            with_it = tuple(n for n in names if n in chosen or n == name)
-            weight = 1 / (count * math.comb(count - 1, len(chosen)))
-            out[name] += weight * (worth[with_it] - value)
+        for name in (one for one in names if one not in chosen):
+            more = worth[tuple(one for one in names if one in chosen or one == name)] - value
+            out[name] += 1 / (len(names) * math.comb(len(names) - 1, len(chosen))) * more
     return out
 
 
 def _at(model: LinearModel, name: str) -> dict[str, Any]:
     """The pointings with the largest residuals, and the range of the axis in these pointings."""
-    evidence = model.evidence
-    left = model.left(model.base)
-    excess = np.array([float(r @ r) - r.size for r in left])
-    pointing = np.array([evidence.image_info[d.index].pointing for d in evidence.discs])
+    discs, taken = model.evidence.discs, [model.evidence.image_info[n] for n in model.evidence.images]
+    excess = np.array([float(r @ r) - r.size for r in model.left(model.base)])
+    pointing = np.array([info.pointing for info in taken])
     by_pointing = {int(one): float(excess[pointing == one].sum()) for one in np.unique(pointing)}
     strongest = sorted(by_pointing, key=lambda one: -by_pointing[one])[:SUSPECT]
     out: dict[str, Any] = {"pointings": sorted(strongest)}
-    taken = [evidence.image_info[d.index] for d in evidence.discs]
-    values = _along(evidence.discs, taken).get(name)
+    values = _along(discs, taken).get(name)
     if values is not None and name not in ("pointing", "gain_mode"):
         here = values[np.isin(pointing, strongest)]
-        low, high = float(here.min()), float(here.max())
-        if name in ("intensity", "exposure"):
-            low, high = math.exp(low), math.exp(high)
-        out["range"] = [low, high]
+        ends = float(here.min()), float(here.max())
+        out["range"] = [math.exp(end) if name in ("intensity", "exposure") else end for end in ends]
     return out

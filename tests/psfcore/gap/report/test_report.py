@@ -155,7 +155,7 @@ def test_limits_alike_and_calibration_are_stated() -> None:
     # The fitted offset is below its own limit, and above what would be found.
     offset, limit = report["effects"][0]["parameters"]["offset"], report["limits"]["dark_offset"]
     assert limit["found_90"] < offset["value"] < limit["excluded_95"]
-    assert report["alike"] == [pair.as_json()]
+    assert report["alike"] == [vars(pair) | {"pair": list(pair.pair)}]
     assert report["calibration"] == {"cases": 19, "covered": 1.0} | ABOUT
     given = Given({(OFFSET,): 1 - LEAST_SHARE / 2, (): LEAST_SHARE / 2}, "attributed", ("dark_offset",))
     report = report_of(with_shares(given))

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from psfcore.gap.evidence.closed_form import ClosedForm
+from psfcore.gap.evidence.closed_form import SUNS, ClosedForm, Form, Variant
 from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
 from psfcore.gap.evidence.tree import FAMILIES, SUN, Field
 from psfcore.gap.verdict import answer as answers
 from psfcore.gap.verdict.answer import (
+    AND_SUN,
     IDLE,
     LEAST_IMAGES,
     Alternative,
@@ -150,7 +152,6 @@ def test_noise_one_effect_and_two_effects_are_told(
         assert (found.none > 0.5) is not names and (found.none < 1e-3) is bool(names)
         assert sum(found.hypotheses.values()) == pytest.approx(1.0)
         assert list(found.hypotheses.values()) == sorted(found.hypotheses.values(), reverse=True)
-        assert {form.effect for form in found.best} >= names
         # A further cause that the data do not show is not listed.
         for labels, share in found.hypotheses.items():
             parts = [part for part in found.hypotheses if part and part < labels]
@@ -161,6 +162,64 @@ def test_noise_one_effect_and_two_effects_are_told(
     noisy = tuple(replace(disc, residual=2 * disc.residual) for disc in wrong.discs)
     found = answer_of(LinearModel(replace(wrong, discs=noisy), FLOOR), 0.9)
     assert found.closed.misfit[0] == pytest.approx(4.0, rel=0.3) and found.named[:1] == ("dark_offset",)
+
+
+class Weights:
+    """A closed form with given ln E of an offset, a gain that changes with time, the Sun, and some of them together."""
+
+    misfit = (1.0, 1.0)
+
+    def __init__(self, alone: dict[str, float], together: dict[frozenset[str], float]) -> None:
+        self.alone, self.given = alone, together
+        nothing, one = np.zeros(0), np.ones(1)
+        self.forms = (
+            Form("offset_place", "dark_offset", None, np.zeros(1, np.intp), one, np.zeros(1, np.bool_)),
+            Form("gain_time", None, LIGHT, np.zeros(1, np.intp), one, np.zeros(1, np.bool_)),
+            Form("sun", SUN, None, nothing.astype(np.intp), nothing, nothing.astype(np.bool_)),
+        )
+
+    def of_form(self, form: Form) -> tuple[np.ndarray, Variant | None]:
+        variant = None if form.is_sun else Variant(form, np.zeros(1, np.intp), 1.0, 0.0)
+        return np.array([self.alone[form.family]]), variant
+
+    def together(self, variants: Sequence[Variant], suns: Sequence[object] = (None,)) -> np.ndarray:
+        acting = frozenset(one.form.family for one in variants) | ({"sun"} if None not in suns else set())
+        one_sun = "sun" in acting and len(suns) == 1  # which has all of the probability
+        return np.array([self.given.get(acting, 0.0) + (math.log(len(SUNS)) if one_sun else 0.0)])
+
+    def fitted(self, variants: Sequence[Variant], sun: object) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros(len(variants)), np.zeros((len(variants),) * 2)
+
+    def normal(self, columns: np.ndarray) -> np.ndarray:
+        return np.zeros((columns.size,) * 2)
+
+    def chi2_left(self, variants: Sequence[Variant], sun: object) -> tuple[float, float]:
+        return 1.0, 1.0
+
+    def forget_suns(self) -> None: ...
+
+
+def test_hypotheses_are_the_same_in_any_order_of_their_causes(
+    evidence: Evidence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The gain of large areas beside the offset and the Sun belongs to the Sun, whichever of both is likelier alone."""
+    offset, gain, sun = "offset_place", "gain_time", "sun"
+    together = {
+        frozenset([offset, sun]): 60.0,
+        frozenset([offset, gain]): 62.0,
+        frozenset([gain, sun]): 21.0,
+        frozenset([offset, gain, sun]): 62.0,
+    }
+    shares = []
+    for alone in (20.0 - 1e-9, 20.0 + 1e-9):
+        weights = Weights({offset: alone, gain: 15.0, sun: 20.0}, together)
+        monkeypatch.setattr(answers, "ClosedForm", lambda *given, weights=weights, **how: weights)
+        shares.append(answer_of(LinearModel(evidence, FLOOR), 0.9).hypotheses)
+    assert shares[0] == pytest.approx(shares[1])
+    # In units of the weight of the offset and the Sun; in the second prior, the gain beside them belongs to the Sun.
+    gained = math.exp(62.0 - 60.0)
+    first, second = 1 / (1 + (1 + AND_SUN) * gained), (1 + gained) / (1 + 2 * gained)
+    assert shares[0][frozenset([DARK, THE_SUN])] == pytest.approx((first + second) / 2)
 
 
 def test_a_gain_in_time_is_the_instrument_or_the_sun(
