@@ -1,9 +1,12 @@
-"""Run a function on a file of strangers in a process of its own, with limited memory and time.
+"""Run a function on a file of strangers in a process of its own, behind a wall and with limited memory and time.
 
 C libraries that read such files may crash, hang, use much memory, or return memory that they did not write. Here they do so
 in a process that ends after one file. It is forked from a server process, which has read no file and was started with a new
 environment, so it holds neither other files nor passwords. A fork takes some milliseconds; a new interpreter would take half
-a second.
+a second. The child can open its file alone, and no socket or program (`psfcore.wall`).
+
+The server tells how a child ended that gave no answer. A crash, too much memory and too much processor time are the fault of the
+file. If something else ended the child, it is tried again; if it was stopped or the machine is too busy, the error is an OSError.
 """
 
 from __future__ import annotations
@@ -11,25 +14,45 @@ from __future__ import annotations
 import atexit
 import contextlib
 import ctypes
+import errno
 import gc
 import importlib
 import json
 import os
 import resource
+import selectors
 import signal
 import socket
 import subprocess
 import sys
 import threading
+import time
 import traceback
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any, BinaryIO
 
 from psfcore.errors import DataError, HeaderError
+from psfcore.wall import raise_wall, walls
 
 MIB = 2**20
 SECONDS = 60  # of processor time; a child may take four times as long if the machine is busy
+LONGEST_S, PATIENCE_S = 4.0 * SECONDS, 4.0 * SECONDS + 30  # of a child, and of the wait for its answer
+TRIES = 3
+EXIT = -1  # a child ended itself
+# What ends a child because of its file; SIGXCPU is the limit of its processor time.
+_OF_FILE = (
+    EXIT,
+    signal.SIGSEGV,
+    signal.SIGBUS,
+    signal.SIGABRT,
+    signal.SIGFPE,
+    signal.SIGILL,
+    signal.SIGTRAP,
+    signal.SIGSYS,
+    signal.SIGXCPU,
+)
 _BYTES_A_PIXEL, _MORE_BYTES = 64, 128 * MIB  # of memory, in addition to the libraries
 _PRELOADED = ("psfcore.fits.hdus",)
 _KEPT_VARIABLES = ("HOME", "PATH", "LANG", "TMPDIR", "OPENBLAS_CORETYPE", "OPENBLAS_L2_SIZE")
@@ -50,7 +73,8 @@ def run_limited(
     function: a function of a module that reads the file ``path``. target: an open file, to which it may write. arguments,
     answer: values that JSON can hold. pixels: the number of pixels of the file, which limits the memory of the child. Raises
     the DataError, HeaderError or OSError of the function; DataError "unreadable-pixels" if the child crashed, or needed more
-    memory or time than its pixels explain.
+    memory or processor time than its pixels explain; OSError if the child was ended from outside again and again, or gave no answer
+    in PATIENCE_S.
     """
     path = Path(path).absolute()
     if _is_child:
@@ -61,30 +85,55 @@ def run_limited(
         "filling": FILLING,
         "arguments": {"path": str(path)} | arguments,
     }
-    content = json.dumps(request).encode()
-    reply = _answered(content, target)
-    if not reply and (_server is None or _server.ended):  # it was killed, and with it perhaps this request
+    content, start = json.dumps(request).encode(), target.tell()
+    for _ in range(TRIES):
         reply = _answered(content, target)
-    if not reply:
-        raise DataError(
-            "unreadable-pixels",
-            f"expected readable pixels in {path.name}; reading {pixels} pixels crashed, or needed much more memory or time than "
-            "they explain: copy or make the file again",
-        )
-    return _result(reply)
+        if not reply.keys() & {"ended", "lost"}:
+            return _result(reply)
+        if reply.get("ended") in _OF_FILE:
+            raise DataError(
+                "unreadable-pixels",
+                f"expected readable pixels in {path.name}; reading {pixels} pixels crashed, or needed much more memory or time than "
+                "they explain: copy or make the file again",
+            )
+        os.ftruncate(target.fileno(), start)
+        os.lseek(target.fileno(), start, os.SEEK_SET)
+    raise OSError(
+        errno.EAGAIN, f"the process that read {path.name} was ended from outside {TRIES} times: try again"
+    )
 
 
 def _answered(request: bytes, target: BinaryIO) -> Answer:
-    """The answer of a child to a request; empty if the child ended without one."""
+    """The answer of a child to a request. If it gave none: "ended" with the signal that ended it, or "lost" if the server ended too."""
     ours, theirs = socket.socketpair()
     with ours:
+        ours.settimeout(PATIENCE_S)
         with theirs:
             _send(theirs.fileno(), target.fileno())
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
             ours.sendall(request + b"\n")
         with ours.makefile("rb") as stream, contextlib.suppress(ConnectionResetError):
-            return dict(json.loads(stream.readline() or b"{}"))
-    return {}
+            for line in stream:
+                with contextlib.suppress(ValueError):  # a part of an answer; how the child ended comes next
+                    return dict(json.loads(line))
+    return {"lost": True}
+
+
+def scratch_file() -> BinaryIO:
+    """A file without a name, which ends with its last use. Behind the wall it is in memory, because no file can be made there."""
+    if _is_child and hasattr(os, "memfd_create"):
+        return os.fdopen(os.memfd_create("scratch"), "w+b")
+    return TemporaryFile()
+
+
+def acting(path: str | Path) -> dict[str, bool]:
+    """Which parts of the wall stand around a child on this machine (`psfcore.wall.walls`). path: any file, which is not read."""
+    with Path(os.devnull).open("wb") as nowhere:
+        return run_limited(_walls, path, nowhere, pixels=0)
+
+
+def _walls(_target: BinaryIO, *, path: str) -> Answer:
+    return dict(walls())
 
 
 def prepare() -> None:
@@ -153,6 +202,15 @@ def _running() -> _Server:
     return _server
 
 
+def _forget() -> None:
+    """In a forked process: another thread may have held the lock in the process before."""
+    global _lock
+    _lock = threading.Lock()
+
+
+os.register_at_fork(after_in_child=_forget)
+
+
 @atexit.register
 def _stop() -> None:
     global _server
@@ -163,25 +221,61 @@ def _stop() -> None:
 
 def _serve() -> None:
     """Fork a child for each pair of files that the owner of this process sends, until the owner has ended."""
-    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # ended children leave nothing behind
     for name in _PRELOADED:
         importlib.import_module(name)
     gc.disable()
     gc.freeze()  # a search for garbage would copy the memory that a child shares with this process
-    with socket.socket(fileno=0) as owner:
+    woken, wake = os.pipe()
+    os.set_blocking(wake, False)
+    signal.signal(signal.SIGCHLD, lambda _signal, _frame: None)
+    signal.set_wakeup_fd(wake)
+    children: dict[
+        int, tuple[int, float]
+    ] = {}  # for each process its connection, and when it must have ended
+    with socket.socket(fileno=0) as owner, selectors.DefaultSelector() as ready:
+        ready.register(owner, selectors.EVENT_READ)
+        ready.register(woken, selectors.EVENT_READ)
         while True:
+            there = {key.fileobj for key, _ in ready.select(1.0 if children else None)}
+            if woken in there:
+                os.read(woken, 4096)
+            _bury(children)
+            if owner not in there:
+                continue
             message, handles, _flags, _address = socket.recv_fds(owner, 1, 2)
             if not message:
                 return
-            if os.fork() == 0:
-                owner.close()
-                _work(*handles)
+            if len(handles) == 2:  # else no file could be opened for them
+                child = os.fork()
+                if child == 0:
+                    _work(*handles)
+                children[child] = os.dup(handles[0]), time.monotonic() + LONGEST_S
             for handle in handles:
                 os.close(handle)
 
 
+def _bury(children: dict[int, tuple[int, float]]) -> None:
+    """Tell of each child how it has ended, which counts if it gave no answer; and kill those that are late."""
+    for child, (connection, until) in list(children.items()):
+        if time.monotonic() > until:
+            os.kill(child, signal.SIGKILL)  # also if it was stopped
+        ended, status = os.waitpid(child, os.WNOHANG)
+        if not ended:
+            continue
+        with contextlib.suppress(OSError):  # the owner has the answer already
+            os.write(
+                connection, b'\n{"ended": %d}\n' % (os.WTERMSIG(status) if os.WIFSIGNALED(status) else EXIT)
+            )
+        os.close(connection)
+        del children[child]
+
+
 def _work(connection: int, target: int) -> None:
     """Run one request and end this process."""
+    signal.set_wakeup_fd(-1)
+    low, high = sorted((connection, target))
+    for first, end in ((3, low), (low + 1, high), (high + 1, resource.getrlimit(resource.RLIMIT_NOFILE)[0])):
+        os.closerange(first, end)  # the connections of other children
     try:
         with socket.socket(fileno=connection) as ours, ours.makefile("rwb") as stream:
             request = json.loads(stream.readline())
@@ -198,13 +292,14 @@ def _reply(request: Answer, target: int) -> Answer:
     _limit(request["memory_bytes"])
     fill_new_memory(request["filling"])
     try:
+        raise_wall([request["arguments"]["path"]])
         with os.fdopen(target, "wb") as file:
             return {"answer": function(file, **request["arguments"])}
     except DataError as error:
         facts = {"code": error.code, "message": error.message, "fields": error.fields}
         return facts | {"is_header_error": isinstance(error, HeaderError)}
     except MemoryError:
-        return {}
+        return {"ended": signal.SIGXCPU}
     except OSError as error:
         return {"errno": error.errno} if error.errno else {"fault": traceback.format_exc()}
     except Exception:  # noqa: BLE001  (the owner raises it)
@@ -215,7 +310,7 @@ def _limit(memory_bytes: int) -> None:
     """Limit the memory and the time of this process."""
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
-    signal.alarm(4 * SECONDS)
+    signal.alarm(round(PATIENCE_S))  # if the server has ended
     if sys.platform == "linux":
         # RLIMIT_DATA also counts what the libraries hold; other systems do not enforce it.
         held = int(Path("/proc/self/statm").read_text().split()[5]) * resource.getpagesize()

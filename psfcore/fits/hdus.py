@@ -15,7 +15,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -30,7 +29,7 @@ from psfcore.fits.blocks import FitsLimits, Hdu, Source, first_image, open_sourc
 from psfcore.fits.cards import optional_number
 from psfcore.fits.compression import may_hold_unwritten_memory
 from psfcore.fits.header import HeaderSummary, is_plane, shape_of, summary_of
-from psfcore.limited import fill_new_memory, run_limited
+from psfcore.limited import fill_new_memory, run_limited, scratch_file
 
 _CHECKSUM_COMMENT = "computed when the file was written"
 # The cards of a tile-compressed image that describe the table of its tiles. FITS standard 4.0, sections 7.3 and 10.1.
@@ -165,7 +164,7 @@ def _decoded_pixels(
     path: str | Path, summary: HeaderSummary, *, twice: bool
 ) -> tuple[NDArray[np.float64], bool]:
     """The pixels of a tile-compressed image, and whether DATASUM contradicts its tiles."""
-    with TemporaryFile() as target:
+    with scratch_file() as target:
         about = run_limited(
             decode_tiles,
             path,

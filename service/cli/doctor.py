@@ -26,6 +26,7 @@ from packaging.utils import canonicalize_name
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
+from psfcore import limited
 from psfcore.compiled import folder_of_kernels
 from psfcore.files import CACHE_VARIABLE
 from service.cli.operator import sentence
@@ -86,6 +87,7 @@ def examine(settings: Settings) -> dict[str, Finding]:
         "versions": versions(),
         "threads": threads(settings),
         "kernels": kernels(),
+        "wall": wall(),
         "storage": storage(settings),
     }
     if settings.store_url:
@@ -187,6 +189,26 @@ def kernels() -> Finding:
     advice = f"set NUMBA_CACHE_DIR or {CACHE_VARIABLE} to a folder to which this user alone can write"
     return Finding(
         "warning", f"each process compiles its kernels again: they cannot be kept in {folder}", advice
+    )
+
+
+def wall() -> Finding:
+    """Which parts of the wall stand around the process that reads files of strangers?"""
+    parts = {
+        "files": "opens its file alone (Landlock)",
+        "calls": "opens no socket and starts no program (seccomp)",
+    }
+    acting = limited.acting(Path(__file__))
+    found = "the process that reads files of strangers " + (
+        " and ".join(text for part, text in parts.items() if acting[part])
+        or "has no wall: it reads what this user reads"
+    )
+    if all(acting.values()):
+        return Finding("ok", found)
+    return Finding(
+        "warning",
+        found,
+        "use Linux 5.13 or later with Landlock, on x86_64 or aarch64, or start the service as a user of its own",
     )
 
 

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import ctypes
 import os
+import resource
 import signal
+import socket
+import sys
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -16,6 +20,7 @@ import pytest
 from psfcore import limited
 from psfcore.errors import DataError, HeaderError
 from psfcore.limited import run_limited
+from psfcore.wall import walls
 
 MIB = 2**20
 
@@ -32,8 +37,39 @@ def work(target: BinaryIO, *, path: str, kind: str) -> dict[str, Any]:
         raise KeyError(kind)
     if kind == "full":
         raise OSError(28, "no space")
+    if kind == "wait":
+        target.write(str(os.getpid()).encode())
+        target.flush()
+        time.sleep(600)
+    if kind == "once" and not target.tell():  # the first try waits for the signal of the test
+        target.write(b"%08d" % os.getpid())
+        target.flush()
+        time.sleep(3)
+    if kind.startswith("wall "):
+        return reached(kind.removeprefix("wall "))
     target.write(Path(path).read_bytes()[::-1])
     return {"process": os.getpid(), "parent": os.getppid(), "variables": sorted(os.environ)}
+
+
+def reached(what: str) -> dict[str, Any]:
+    """What the child reaches beyond its wall: empty if it is refused."""
+    name, _, place = what.partition(" ")
+    try:
+        if name == "read":
+            return {"found": Path(place).read_bytes()[:10].decode("latin-1")}
+        if name == "list":
+            return {"found": os.listdir(place)}
+        if name == "write":
+            Path(place).write_bytes(b"x")
+        elif name == "socket":
+            socket.create_connection(("127.0.0.1", int(place)), 2)
+        elif name == "exec":
+            os.execv("/bin/true", ["true"])
+        elif name == "signal":
+            os.kill(int(place), signal.SIGTERM)
+    except PermissionError:
+        return walls()
+    return {"found": what}
 
 
 def answer(path: Path, kind: str) -> tuple[dict[str, Any], bytes]:
@@ -96,3 +132,97 @@ def test_a_process_that_was_forked_has_a_server_of_its_own(path: Path) -> None:
     assert 0 < int(os.read(reader, 20)) != server
     os.wait()
     assert answer(path, "read")[0]["parent"] == server
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the wall is made of parts of Linux")
+def test_the_child_reaches_its_file_and_nothing_else(path: Path) -> None:
+    """The database, the key file and other uploads of this user; a socket; a program; another process."""
+    secret = path.with_name("heliopsf.db")
+    secret.write_bytes(b"keys")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        others = [f"read {secret}", "read /etc/passwd", f"read /proc/{os.getpid()}/environ"]
+        others += [f"list {path.parent}", f"write {path}", f"write {path.parent / 'new'}"]
+        beyond = {"files": others, "calls": [f"socket {port}", "exec", f"signal {os.getpid()}"]}
+        acting = limited.acting(path)
+        for what in (one for part, several in beyond.items() if acting[part] for one in several):
+            assert answer(path, f"wall {what}")[0] == acting, what
+        if not all(acting.values()):
+            pytest.skip(f"this kernel has not all parts of the wall: {acting}")
+    assert path.read_bytes() == b"abc" and not (path.parent / "new").exists()
+
+
+def child_of(target: BinaryIO) -> int:
+    """The process that writes its number to a file."""
+    for _ in range(2000):
+        content = os.pread(target.fileno(), 20, 0)
+        if content:
+            return int(content)
+        time.sleep(0.01)
+    raise AssertionError("no child")
+
+
+def test_a_child_that_is_killed_from_outside_is_tried_again(path: Path) -> None:
+    """An honest file is not blamed; if it happens again and again, the error is one of the system."""
+    with TemporaryFile() as target, ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(run_limited, work, path, target, pixels=10, kind="once")
+        os.kill(child_of(target), signal.SIGKILL)
+        time.sleep(0.2)
+        about = waiting.result()
+        assert about["process"] and os.pread(target.fileno(), 20, 0).endswith(b"cba")
+    with TemporaryFile() as target, ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(run_limited, work, path, target, pixels=10, kind="wait")
+        for _ in range(limited.TRIES):
+            os.kill(child_of(target), signal.SIGKILL)
+            time.sleep(0.3)
+        with pytest.raises(OSError, match="ended from outside"):
+            waiting.result()
+
+
+def test_a_child_that_was_stopped_does_not_hold_its_caller(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limited, "PATIENCE_S", 2.0)
+    with TemporaryFile() as target, ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(run_limited, work, path, target, pixels=10, kind="wait")
+        child = child_of(target)
+        os.kill(child, signal.SIGSTOP)
+        with pytest.raises(TimeoutError):
+            waiting.result()
+        os.kill(child, signal.SIGKILL)
+
+
+def test_a_process_without_open_files_left_is_told_so(path: Path) -> None:
+    answer(path, "read")
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with TemporaryFile() as target:
+        free = os.dup(target.fileno())  # the lowest number that is free
+        os.close(free)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (free, hard))
+        try:
+            with pytest.raises(OSError, match="Too many open files"):
+                run_limited(work, path, target, pixels=10, kind="read")
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+def test_a_fork_beside_a_held_lock_reads_files(path: Path) -> None:
+    held, go = threading.Event(), threading.Event()
+
+    def hold() -> None:
+        with limited._lock:
+            held.set()
+            go.wait(20)
+
+    holder = threading.Thread(target=hold)
+    holder.start()
+    held.wait(20)
+    child = os.fork()
+    if child == 0:
+        signal.alarm(20)
+        good = answer(path, "read")[1] == b"cba"
+        limited._stop()
+        os._exit(0 if good else 1)
+    go.set()
+    holder.join()
+    assert os.waitpid(child, 0)[1] == 0

@@ -74,12 +74,19 @@ def test_with_nothing_there_it_says_so_and_makes_nothing(tmp_path: Path) -> None
 def test_all_is_well_where_a_worker_is_there(catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
     catalogue.census.announce("host:1", time.time(), software_version())
     assert set(states()) == {
-        "versions", "threads", "kernels", "storage", "broker", "database", "schema", "clock", "workers", "stuck jobs",
+        "versions", "threads", "kernels", "wall", "storage", "broker", "database", "schema", "clock", "workers", "stuck jobs",
     }  # fmt: skip
     found = findings()
     for what in ("kernels", "storage", "broker", "database", "schema", "clock", "workers", "stuck jobs"):
         assert found[what]["state"] == "ok", found[what]
     assert "host:1" in found["workers"]["found"]
+    for acting, state, word in (
+        ({"files": True, "calls": True}, "ok", "its file alone"),
+        ({"files": False, "calls": True}, "warning", "no socket"),
+        ({"files": False, "calls": False}, "warning", "no wall"),
+    ):
+        monkeypatch.setattr(cli_doctor.limited, "acting", lambda path, acting=acting: acting)
+        assert findings()["wall"]["state"] == state and word in findings()["wall"]["found"]
     monkeypatch.setattr(cli_doctor, "folder_of_kernels", lambda: (Path("/nowhere"), False))
     told = findings()["kernels"]
     assert told["state"] == "warning" and "/nowhere" in told["found"] and "NUMBA_CACHE_DIR" in told["advice"]

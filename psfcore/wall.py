@@ -1,0 +1,152 @@
+"""A wall around a process that reads a file of strangers: a C library that such a file misuses finds nothing behind it.
+
+Two parts of Linux make the wall, and neither can be taken down again by the process:
+
+- Landlock (Linux 5.13 and later): of all files the process can open those that it may read, and the folders of the libraries' code.
+  Files that are open already stay open.
+- seccomp: the process cannot make sockets, start programs, or reach other processes.
+
+    raise_wall([path])
+    walls()     # {"files": True, "calls": True}
+
+Sources: man pages landlock(7), seccomp(2); include/uapi/linux/landlock.h and the tables of system calls of Linux 6.12.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import os
+import platform
+import site
+import sys
+import sysconfig
+from collections.abc import Iterable
+from pathlib import Path
+
+_CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446  # system calls, the same on every machine
+_VERSION, _PATH_BENEATH = 1, 1
+_READ_FILE, _READ_FOLDER = 1 << 2, 1 << 3
+# The number of kinds of access to files that each version of Landlock knows.
+_KINDS = {1: 13, 2: 14, 3: 15, 4: 15}
+_LATEST_KINDS = 16
+_SET_NO_NEW_PRIVS, _SET_SECCOMP, _FILTER = 38, 22, 2
+_LOAD, _EQUAL, _AT_LEAST, _RETURN = 0x20, 0x15, 0x35, 0x06  # instructions of BPF
+_NUMBER_AT, _MACHINE_AT = 0, 4  # in struct seccomp_data
+_ALLOW, _REFUSE = 0x7FFF0000, 0x00050000 | errno.EPERM
+_OTHER_NUMBERS = 0x40000000  # system calls of the x32 interface
+# For each machine: its number in the audit interface, and the system calls that are refused.
+_MACHINES: dict[str, tuple[int, dict[str, int]]] = {
+    "x86_64": (0xC000003E, {
+        "socket": 41, "connect": 42, "accept": 43, "bind": 49, "listen": 50, "socketpair": 53, "fork": 57,
+        "vfork": 58, "execve": 59, "kill": 62, "ptrace": 101, "mount": 165, "accept4": 288, "add_key": 248,
+        "request_key": 249, "keyctl": 250, "unshare": 272, "perf_event_open": 298, "open_by_handle_at": 304,
+        "setns": 308, "process_vm_readv": 310, "process_vm_writev": 311, "bpf": 321, "execveat": 322,
+        "userfaultfd": 323, "io_uring_setup": 425, "pidfd_open": 434, "pidfd_getfd": 438,
+    }),
+    "aarch64": (0xC00000B7, {
+        "mount": 40, "unshare": 97, "ptrace": 117, "kill": 129, "socket": 198, "socketpair": 199, "bind": 200,
+        "listen": 201, "accept": 202, "connect": 203, "add_key": 217, "request_key": 218, "keyctl": 219,
+        "execve": 221, "perf_event_open": 241, "accept4": 242, "open_by_handle_at": 265, "setns": 268,
+        "process_vm_readv": 270, "process_vm_writev": 271, "bpf": 280, "execveat": 281, "userfaultfd": 282,
+        "io_uring_setup": 425, "pidfd_open": 434, "pidfd_getfd": 438,
+    }),
+}  # fmt: skip
+_up = {"files": False, "calls": False}
+
+
+class _Ruleset(ctypes.Structure):
+    _fields_ = (("files", ctypes.c_uint64),)
+
+
+class _Beneath(ctypes.Structure):
+    _pack_ = 1
+    _fields_ = (("allowed", ctypes.c_uint64), ("folder", ctypes.c_int32))
+
+
+class _Instruction(ctypes.Structure):
+    _fields_ = (
+        ("code", ctypes.c_uint16),
+        ("yes", ctypes.c_uint8),
+        ("no", ctypes.c_uint8),
+        ("value", ctypes.c_uint32),
+    )
+
+
+class _Program(ctypes.Structure):
+    _fields_ = (("length", ctypes.c_uint16), ("first", ctypes.POINTER(_Instruction)))
+
+
+def raise_wall(files: Iterable[str | Path]) -> None:
+    """Raise the wall around this process, as far as its kernel has the parts. files: the files that it may still open to read.
+
+    Raises OSError if a part exists and cannot be raised, or a file cannot be opened.
+    """
+    if sys.platform != "linux":
+        return
+    libc = ctypes.CDLL(None, use_errno=True)
+    _called(libc.prctl(_SET_NO_NEW_PRIVS, 1, 0, 0, 0))
+    _up["files"] = _close_files(libc, files)
+    _up["calls"] = _close_calls(libc)
+
+
+def walls() -> dict[str, bool]:
+    """Which parts of the wall stand around this process."""
+    return dict(_up)
+
+
+def _called(result: int) -> int:
+    """The result of a function of C. Raises OSError if it failed."""
+    if result < 0:
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number))
+    return result
+
+
+def _close_files(libc: ctypes.CDLL, files: Iterable[str | Path]) -> bool:
+    version = libc.syscall(_CREATE_RULESET, None, 0, _VERSION)
+    if version < 1:
+        return False
+    kinds = _Ruleset((1 << _KINDS.get(version, _LATEST_KINDS)) - 1)
+    rules = _called(libc.syscall(_CREATE_RULESET, ctypes.byref(kinds), ctypes.sizeof(kinds), 0))
+    for path in (*files, *_code()):
+        here = os.open(path, os.O_PATH | os.O_CLOEXEC)
+        allowed = _READ_FILE | (_READ_FOLDER if Path(path).is_dir() else 0)
+        _called(libc.syscall(_ADD_RULE, rules, _PATH_BENEATH, ctypes.byref(_Beneath(allowed, here)), 0))
+        os.close(here)
+    _called(libc.syscall(_RESTRICT_SELF, rules, 0))
+    os.close(rules)
+    return True
+
+
+def _code() -> list[Path]:
+    """The places of the code of Python and of its libraries: a function may import a module only when it needs it."""
+    named = [
+        *site.getsitepackages(),
+        *(sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")),
+    ]
+    of_system = ("/lib", "/lib64", "/usr/lib", "/usr/lib64", "/etc/ld.so.cache")
+    places = {Path(one).resolve() for one in (*named, *of_system, str(Path(__file__).parent))}
+    return sorted(one for one in places if one.exists())
+
+
+def _close_calls(libc: ctypes.CDLL) -> bool:
+    if platform.machine() not in _MACHINES:
+        return False
+    machine, refused = _MACHINES[platform.machine()]
+    count = len(refused)
+    program = [
+        (_LOAD, 0, 0, _MACHINE_AT),
+        (_EQUAL, 0, count + 3, machine),
+        (_LOAD, 0, 0, _NUMBER_AT),
+        (_AT_LEAST, count + 1, 0, _OTHER_NUMBERS),
+        *((_EQUAL, count - k, 0, number) for k, number in enumerate(refused.values())),
+        (_RETURN, 0, 0, _ALLOW),
+        (_RETURN, 0, 0, _REFUSE),
+    ]
+    instructions = (_Instruction * len(program))(*(_Instruction(*one) for one in program))
+    if libc.prctl(_SET_SECCOMP, _FILTER, ctypes.byref(_Program(len(program), instructions)), 0, 0) == 0:
+        return True
+    if ctypes.get_errno() == errno.EINVAL:  # a kernel without seccomp
+        return False
+    raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
