@@ -54,6 +54,7 @@ _OF_FILE = (
     signal.SIGXCPU,
 )
 _BYTES_A_PIXEL, _MORE_BYTES = 64, 128 * MIB  # of memory, in addition to the libraries
+# Modules with a function that lets their library do what it does once, before there is a wall.
 _PRELOADED = ("psfcore.fits.hdus",)
 _KEPT_VARIABLES = ("HOME", "PATH", "LANG", "TMPDIR", "OPENBLAS_CORETYPE", "OPENBLAS_L2_SIZE")
 _M_PERTURB = -6  # option of mallopt(3): new memory is filled with this byte
@@ -222,7 +223,7 @@ def _stop() -> None:
 def _serve() -> None:
     """Fork a child for each pair of files that the owner of this process sends, until the owner has ended."""
     for name in _PRELOADED:
-        importlib.import_module(name)
+        importlib.import_module(name).prepare_library()
     gc.disable()
     gc.freeze()  # a search for garbage would copy the memory that a child shares with this process
     woken, wake = os.pipe()

@@ -16,10 +16,11 @@ from tempfile import TemporaryFile
 from typing import Any, BinaryIO
 
 import pytest
+from astropy.io import fits
 
 from psfcore import limited
 from psfcore.errors import DataError, HeaderError
-from psfcore.limited import run_limited
+from psfcore.limited import run_limited, scratch_file
 from psfcore.wall import walls
 
 MIB = 2**20
@@ -37,6 +38,9 @@ def work(target: BinaryIO, *, path: str, kind: str) -> dict[str, Any]:
         raise KeyError(kind)
     if kind == "full":
         raise OSError(28, "no space")
+    if kind == "hdus":
+        fits.HDUList([fits.PrimaryHDU()]).writeto(target)
+        return {"is_child": scratch_file().write(b"x") == 1}
     if kind == "wait":
         target.write(str(os.getpid()).encode())
         target.flush()
@@ -150,6 +154,12 @@ def test_the_child_reaches_its_file_and_nothing_else(path: Path) -> None:
         if not all(acting.values()):
             pytest.skip(f"this kernel has not all parts of the wall: {acting}")
     assert path.read_bytes() == b"abc" and not (path.parent / "new").exists()
+
+
+def test_what_libraries_do_once_is_done_before_there_is_a_wall(path: Path) -> None:
+    """For its first HDU list astropy makes a file of its own; a scratch file behind the wall is in memory."""
+    about, content = answer(path, "hdus")
+    assert about["is_child"] and content.startswith(b"SIMPLE")
 
 
 def child_of(target: BinaryIO) -> int:
