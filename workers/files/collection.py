@@ -182,14 +182,17 @@ def remove_unnamed(catalogue: Catalogue, store: Store, digests: Iterable[str]) -
 def settle(catalogue: Catalogue, store: Store, digests: set[str]) -> set[str]:
     """Bring back those of the files moved aside to which a row refers, and delete the others.
 
-    Returns the hashes of the files that were brought back. If this is interrupted, the next call finds the files.
+    A file to which a row refers is deleted aside only after the store shows it in its place: that it was not brought back may also
+    mean that the store could not find it for a moment. Returns the hashes of the files that were brought back. If this is interrupted,
+    the next call finds the files.
     """
     if not digests:
         return set()
     named = digests.intersection(catalogue.named_files.all())
     back = {digest for digest in named if store.bring_back(digest)}
     for digest in digests:
-        store.delete_aside(digest)
+        if digest not in named or store.kept_at(digest) is not None:
+            store.delete_aside(digest)
     return back
 
 
