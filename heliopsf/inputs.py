@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -45,6 +45,7 @@ _EXPECTED = (
     "file, or a list of these"
 )
 _HDUS = (fits.PrimaryHDU, fits.ImageHDU, fits.CompImageHDU)
+_NO_VALUES = ("HISTORY", "KEYCOMMENTS", "COMMENT", "SIMPLE", "END", "")
 _UNITS = {
     "XPOSURE": "s",
     "EXPTIME": "s",
@@ -84,13 +85,13 @@ def is_pair(image: Any) -> bool:
 @contextmanager
 def on_disk(image: Any) -> Iterator[Any]:
     """The path of a temporary file with the bytes of a FITS file; any other image unchanged."""
-    if not isinstance(image, bytes | bytearray | memoryview):
+    if isinstance(image, bytes | bytearray | memoryview):
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "image.fits"
+            path.write_bytes(image)
+            yield path
+    else:
         yield image
-        return
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "image.fits"
-        path.write_bytes(image)
-        yield path
 
 
 def is_sequence(image: Any) -> bool:
@@ -105,9 +106,8 @@ def is_many(image: Any) -> bool:
 
 
 def _is_of(image: Any, module: str, name: str) -> bool:
-    loaded = sys.modules.get(module)
     # While a module is imported, it has no classes yet.
-    return loaded is not None and isinstance(image, getattr(loaded, name, ()))
+    return isinstance(image, getattr(sys.modules.get(module), name, ()))
 
 
 def image_of(image: Any, *, saturation: Any, hdu: int | None = None) -> Image:
@@ -126,10 +126,12 @@ def image_of(image: Any, *, saturation: Any, hdu: int | None = None) -> Image:
         return observation_of_hdus(hdus, number, chosen=hdu, saturation_dn=level)
     parts = _parts_of(image)
     data = _computed(parts.data)
-    pixels = real_pixels(data)
-    planes = {name: np.asarray(plane) for name, plane in parts.planes.items() if plane is not None}
     return observation_of(
-        pixels, parts.header, bits=stored_bits(data, parts.header), planes=planes, saturation_dn=level
+        real_pixels(data),
+        parts.header,
+        bits=stored_bits(data, parts.header),
+        planes={name: np.asarray(plane) for name, plane in parts.planes.items() if plane is not None},
+        saturation_dn=level,
     )
 
 
@@ -150,10 +152,13 @@ def uncertainty_of(image: Any) -> NDArray[np.float64] | None:
             units.Quantity(deviation.array, deviation.unit or unit).to_value(unit), dtype=np.float64
         )
     except (TypeError, units.UnitsError) as error:
-        message = (
-            f"the uncertainty of the image is not used: expected a standard deviation or variance; {error}"
+        warnings.warn(
+            DataWarning(
+                "uncertainty-dropped",
+                f"the uncertainty of the image is not used: expected a standard deviation or variance; {error}",
+            ),
+            stacklevel=4,
         )
-        warnings.warn(DataWarning("uncertainty-dropped", message), stacklevel=4)
         return None
 
 
@@ -207,9 +212,8 @@ def _chosen(image: Any, number: int | None) -> tuple[int, dict[int, Any]]:
         if wanted and n in images:
             return n, images
         if wanted and is_hdu(one):
-            many = len(one.shape) > 2 and len(hdus) > 1
             raise DataError(
-                "three-axes" if many else "not-2d",
+                "three-axes" if len(one.shape) > 2 and len(hdus) > 1 else "not-2d",
                 f"expected an image with two axes; HDU {n} has {len(one.shape)}: choose another HDU, or one plane of it",
             )
     raise DataError(
@@ -222,14 +226,14 @@ def _chosen(image: Any, number: int | None) -> tuple[int, dict[int, Any]]:
 def _parts_of(image: Any) -> _Parts:
     """An image in memory with its header. Raises ``DataError`` "bad-input" and "bad-unit"."""
     image, meta = image if is_pair(image) else (image, {})
-    unit, header = getattr(image, "unit", None), _header(meta)
+    header = _header(image.meta if is_nddata(image) else meta)
     if is_nddata(image):
-        header = _header(image.meta)
-        if not is_map(image):
-            _add_coordinates(header, image.wcs)
-        kind = getattr(image.uncertainty, "uncertainty_type", None)
-        errors = image.uncertainty.array if kind in ("std", "var") else None
-        parts = _Parts(image.data, header, {FLAGS[0]: image.mask, ERRORS[0]: errors})
+        # ``CCDData.read`` takes the cards of the coordinates out of the header.
+        if not is_map(image) and hasattr(image.wcs, "to_header"):
+            header.extend(image.wcs.to_header(), strip=False, unique=True, end=True)
+        known = getattr(image.uncertainty, "uncertainty_type", None) in ("std", "var")
+        planes = {FLAGS[0]: image.mask, ERRORS[0]: image.uncertainty.array if known else None}
+        parts = _Parts(image.data, header, planes)
     elif isinstance(image, np.ndarray):
         plain = getattr(image, "unmasked", image)
         plain = plain.value if isinstance(plain, units.Quantity) else plain
@@ -238,11 +242,10 @@ def _parts_of(image: Any) -> _Parts:
         parts = _Parts(image, header, {})
     else:
         raise DataError("bad-input", f"expected {_EXPECTED}; got {type(image).__name__}")
-    if "BUNIT" in header:
-        if not is_map(image):
-            unit_text(unit)  # refuses logarithmic units
-    elif (text := unit_text(unit)) is not None:
-        header["BUNIT"] = text
+    # The unit is read even if the header gives one, because it may be logarithmic. That of a Map is the one of its header.
+    text = None if is_map(image) and "BUNIT" in header else unit_text(getattr(image, "unit", None))
+    if text is not None:
+        header.setdefault("BUNIT", text)
     return parts
 
 
@@ -250,8 +253,13 @@ def _computed(data: Any) -> NDArray[Any]:
     """The pixels. A dask array is computed, with a ``DataWarning`` "dask-computed"."""
     if not hasattr(data, "compute"):
         return np.asarray(data)
-    message = f"the dask array of {' x '.join(map(str, data.shape[::-1]))} px is computed; the result is an array in memory"
-    warnings.warn(DataWarning("dask-computed", message), stacklevel=5)
+    warnings.warn(
+        DataWarning(
+            "dask-computed",
+            f"the dask array of {' x '.join(map(str, data.shape[::-1]))} px is computed; the result is an array in memory",
+        ),
+        stacklevel=5,
+    )
     return np.asarray(data.compute())
 
 
@@ -267,11 +275,9 @@ def unit_text(unit: Any) -> str | None:
             "the pixels first",
         )
     pixel_free = unit * units.pix if units.pix in getattr(unit, "bases", ()) else unit
-    for count in COUNTS:
-        if pixel_free == count:
-            return "DN"
-        if pixel_free == count / units.s:
-            return "DN/s"
+    for text, time in (("DN", units.dimensionless_unscaled), ("DN/s", units.s)):
+        if any(pixel_free == count / time for count in COUNTS):
+            return text
     return str(unit) or None
 
 
@@ -282,26 +288,14 @@ def _header(meta: Mapping[str, Any]) -> Header:
     header = Header()
     for key, value in meta.items():
         name = str(key).upper()
-        if name in ("KEYCOMMENTS", "COMMENT", "SIMPLE", "END", ""):
-            continue
-        try:
+        with suppress(*card_trouble()):
             if isinstance(value, units.Quantity):
                 value = value.to_value(_UNITS.get(name, value.unit))
             for line in str(value).splitlines() if name == "HISTORY" else ():
                 header.add_history(line)
-            if name != "HISTORY":
+            if name not in _NO_VALUES:
                 header[long_key(name)] = plain_value(value)
-        except card_trouble():
-            continue
     return header
-
-
-def _add_coordinates(header: Header, wcs: Any) -> None:
-    """Add the cards of a WCS, which ``CCDData.read`` takes out of the header."""
-    if hasattr(wcs, "to_header"):
-        for card in wcs.to_header().cards:
-            if card.keyword not in header:
-                header.append(card, end=True)
 
 
 def box_of(region: Any, image: Any) -> Box:
@@ -314,23 +308,29 @@ def box_of(region: Any, image: Any) -> Box:
     shape = shape_of(image)
     if isinstance(region, str):
         return Box.parse(region).checked(shape)
-    if not isinstance(region, tuple | list) or len(region) != 2:
-        raise _bad(region)
-    if all(isinstance(part, slice) for part in region):
-        return _of_slices(region[0], region[1], shape).checked(shape)
-    if not is_map(image):
-        raise _bad(region)
+    two = isinstance(region, tuple | list) and len(region) == 2
+    if two and all(isinstance(part, slice) for part in region):
+        steps = [part.step for part in region if part.step not in (None, 1)]
+        if steps:
+            raise DataError("bad-region", f"expected slices without a step; got a step of {steps[0]}")
+        (y0, y1, _), (x0, x1, _) = (part.indices(size) for part, size in zip(region, shape, strict=True))
+        return Box(x0, x1, y0, y1).checked(shape)
+    if not two or not is_map(image):
+        raise DataError(
+            "bad-region",
+            'expected a region as "x0:x1,y0:y1", as np.s_[y0:y1, x0:x1], or for a Map as its bottom left and top right corner; '
+            f"got {region!r:.80}",
+        )
     try:
         part = image.submap(region[0], top_right=region[1])
     except (ValueError, TypeError, AttributeError, units.UnitsError) as error:
         raise DataError(
             "bad-region", f"expected two corners that Map.submap accepts; it says: {error}"
         ) from error
-    moved = (
+    x0, y0 = (
         round(float((whole - cut).to_value(units.pix)))
         for whole, cut in zip(image.reference_pixel, part.reference_pixel, strict=True)
     )
-    x0, y0 = moved
     ny, nx = part.data.shape
     return Box(x0, x0 + nx, y0, y0 + ny).checked(shape)
 
@@ -338,9 +338,8 @@ def box_of(region: Any, image: Any) -> Box:
 def cut(image: Any, box: Box) -> Any:
     """The box of a Map, an NDData or an HDU, with its coordinates; other images unchanged."""
     if is_map(image):
-        corners = ((box.x0, box.y0), (box.x1 - 1, box.y1 - 1))
-        bottom_left, top_right = (list(corner) * units.pix for corner in corners)
-        return image.submap(bottom_left, top_right=top_right)
+        top_right = [box.x1 - 1, box.y1 - 1] * units.pix
+        return image.submap([box.x0, box.y0] * units.pix, top_right=top_right)
     rows, columns = box.slices
     if is_nddata(image):
         return type(image)(
@@ -361,10 +360,8 @@ def cut(image: Any, box: Box) -> Any:
 
 def _part_of(wcs: Any, box: Box) -> Any:
     """The coordinates of a box. Those of a slice of a cube are no ``WCS``, and have no slices of their own."""
-    if wcs is None:
-        return None
-    if hasattr(wcs, "to_header"):
-        return wcs[box.slices]
+    if wcs is None or hasattr(wcs, "to_header"):
+        return None if wcs is None else wcs[box.slices]
     from astropy.wcs.wcsapi import SlicedLowLevelWCS
 
     return SlicedLowLevelWCS(wcs.low_level_wcs, box.slices)
@@ -380,19 +377,3 @@ def _moved(meta: Mapping[str, Any] | Header, columns: slice, rows: slice) -> Any
         if name.startswith("CRPIX") and (at := number_of(value)) is not None:
             moved[key] = at - (columns if name[5:6] == "1" else rows).start
     return moved
-
-
-def _of_slices(rows: slice, columns: slice, shape: tuple[int, int]) -> Box:
-    for part in (rows, columns):
-        if part.step not in (None, 1):
-            raise DataError("bad-region", f"expected slices without a step; got a step of {part.step}")
-    (y0, y1, _), (x0, x1, _) = rows.indices(shape[0]), columns.indices(shape[1])
-    return Box(x0, x1, y0, y1)
-
-
-def _bad(region: Any) -> DataError:
-    return DataError(
-        "bad-region",
-        'expected a region as "x0:x1,y0:y1", as np.s_[y0:y1, x0:x1], or for a Map as its bottom left and top right corner; '
-        f"got {region!r:.80}",
-    )

@@ -31,6 +31,8 @@ from psfcore.fits.cards import (
     card_flag,
     card_text,
     card_trouble,
+    check_card,
+    check_header,
     optional_text,
 )
 from psfcore.fits.compression import check_compression, check_counts
@@ -92,8 +94,34 @@ class Hdu:
 
     @property
     def end(self) -> int:
-        """Where the data end, by their declared size. Raises HeaderError "bad-card" or "random-groups"."""
-        return self.start + _data_bytes(self.header, self.number)
+        """Where the data end, by their declared size. Raises HeaderError "bad-card" or "random-groups".
+
+        The size is |BITPIX| / 8 * GCOUNT * (PCOUNT + prod NAXISn), FITS standard Eq. (2).
+        """
+        bitpix = card_count(self.header, "BITPIX", smallest=-64, largest=64)
+        check_card(bitpix in _BITPIX, f"BITPIX of {_BITPIX} in HDU {self.number}", bitpix)
+        axes = range(1, card_count(self.header, "NAXIS", largest=999) + 1)
+        if not axes:
+            return self.start
+        check_header(
+            self.number > 0 or not card_flag(self.header, "GROUPS"),
+            "random-groups",
+            "expected an image in a primary array or an image extension; got random groups (GROUPS = T): write the "
+            "image into a primary array without the card GROUPS",
+        )
+        elements = math.prod(card_count(self.header, f"NAXIS{axis}") for axis in axes)
+        groups, extra = (
+            card_count(self.header, "GCOUNT", default=1),
+            card_count(self.header, "PCOUNT", default=0),
+        )
+        size = abs(bitpix) // 8 * groups * (extra + elements)
+        check_header(
+            size <= LARGEST_COUNT,
+            "bad-card",
+            f"expected a data size below 2^63 bytes in HDU {self.number}; its header declares about 2^{size.bit_length()} bytes: copy or "
+            "make the file again",
+        )
+        return self.start + size
 
     @property
     def name(self) -> str:
@@ -140,11 +168,11 @@ class _GzipSource:
         self.position = 0
 
     def read(self, count: int) -> bytes:
-        if self.position + count > self._budget_bytes:
-            raise HeaderError(
-                "too-many-bytes",
-                "expected decompressed data within the size limit; got more bytes: use a smaller file",
-            )
+        check_header(
+            self.position + count <= self._budget_bytes,
+            "too-many-bytes",
+            "expected decompressed data within the size limit; got more bytes: use a smaller file",
+        )
         try:
             content = self._stream.read(count)
         except EOFError:
@@ -175,8 +203,9 @@ def open_source(path: Path, limits: FitsLimits) -> Iterator[Source]:
     with path.open("rb") as file:
         start = file.read(2)
         file.seek(0)
-        if not start:
-            raise HeaderError("empty-file", "expected a FITS file; got an empty file: copy the file again")
+        check_header(
+            start != b"", "empty-file", "expected a FITS file; got an empty file: copy the file again"
+        )
         if start == b"\x1f\x8b":
             yield _GzipSource(file, limits.max_pixels * 16 + limits.max_hdus * limits.max_header_bytes)
         else:
@@ -193,8 +222,12 @@ def walk(source: Source, limits: FitsLimits) -> Iterator[Hdu]:
         raw = _read_header(source, limits.max_header_bytes - header_bytes, limits, first=number == 0)
         if raw is None:
             return
-        if number == limits.max_hdus:
-            break
+        check_header(
+            number < limits.max_hdus,
+            "too-many-hdus",
+            f"expected at most {limits.max_hdus} HDUs, and an image in one of them; got more HDUs: write the image into a "
+            "file of its own",
+        )
         header_bytes += len(raw)
         # With another value astropy calls the HDU corrupted, and then reads on without an end.
         if number == 0 and not _SIMPLE.fullmatch(raw[:CARD_BYTES]):
@@ -206,11 +239,6 @@ def walk(source: Source, limits: FitsLimits) -> Iterator[Hdu]:
         yield hdu
         skip_data(source, hdu, limits)
         source.skip(-hdu.end % BLOCK_BYTES)
-    message = (
-        f"expected at most {limits.max_hdus} HDUs, and an image in one of them; got more HDUs: write the image into a "
-        "file of its own"
-    )
-    raise HeaderError("too-many-hdus", message)
 
 
 def first_image(hdus: Iterator[Hdu], limits: FitsLimits, number: int | None = None) -> Hdu:
@@ -221,12 +249,11 @@ def first_image(hdus: Iterator[Hdu], limits: FitsLimits, number: int | None = No
     kinds: list[str] = []
     for hdu in hdus:
         kinds.append(hdu.kind)
-        if number not in (None, hdu.number):
-            continue
-        if hdu.kind == "image":
+        chosen = number in (None, hdu.number)
+        if chosen and hdu.kind == "image":
             _check_image(hdu.header, limits)
             return hdu
-        if number is not None or hdu.kind.startswith("cube"):
+        if chosen and (number is not None or hdu.kind.startswith("cube")):
             break
     if number is not None and len(kinds) <= number:
         raise HeaderError("no-image", f"expected an HDU of the file, 0 to {len(kinds) - 1}; got {number}")
@@ -238,20 +265,22 @@ def skip_data(source: Source, hdu: Hdu, limits: FitsLimits) -> None:
     _check_size(source, hdu, limits)
     size = hdu.end - source.position
     there = source.skip(size)
-    if there < size:
-        expected = f"expected {size} bytes of data in HDU {hdu.number}, as its header declares"
-        raise HeaderError("truncated-data", f"{expected}; got {there}: copy the file again")
+    check_header(
+        there >= size,
+        "truncated-data",
+        f"expected {size} bytes of data in HDU {hdu.number}, as its header declares; got {there}: copy the file again",
+    )
 
 
 def _check_size(source: Source, hdu: Hdu, limits: FitsLimits) -> None:
     """Raise HeaderError "too-many-bytes" if too many bytes would have to be decompressed to skip the data of an HDU."""
     size = hdu.end - hdu.start
-    if source.gzipped and size > limits.max_pixels * 16:
-        message = (
-            f"expected at most {limits.max_pixels * 16} bytes of data in an HDU; HDU {hdu.number} declares "
-            f"{size}: decompress the file, or write the image into a file of its own"
-        )
-        raise HeaderError("too-many-bytes", message)
+    check_header(
+        not source.gzipped or size <= limits.max_pixels * 16,
+        "too-many-bytes",
+        f"expected at most {limits.max_pixels * 16} bytes of data in an HDU; HDU {hdu.number} declares "
+        f"{size}: decompress the file, or write the image into a file of its own",
+    )
 
 
 def _no_image(kinds: list[str]) -> HeaderError:
@@ -269,8 +298,9 @@ def _no_image(kinds: list[str]) -> HeaderError:
         return HeaderError("not-2d", f"{expected}; got an image of one axis: store the image with two axes")
     if "table" in kinds:
         return HeaderError("table-only", f"{expected}; got only tables ({count}): use a file with an image")
-    message = f"{expected}; got {count}, and none has data with two axes: use a file with an image"
-    return HeaderError("no-image", message)
+    return HeaderError(
+        "no-image", f"{expected}; got {count}, and none has data with two axes: use a file with an image"
+    )
 
 
 def _read_header(source: Source, most: int, limits: FitsLimits, *, first: bool) -> bytes | None:
@@ -289,15 +319,16 @@ def _read_header(source: Source, most: int, limits: FitsLimits, *, first: bool) 
         raw += block if end is None else block[:end]
         if end is not None:
             return bytes(raw)
-        if len(block) < BLOCK_BYTES:
-            got = f"the file stops after {len(raw)} bytes of this header"
-            message = f"expected an END card; {got}: copy the file again"
-            raise HeaderError("truncated-header", message)
-    message = (
+        check_header(
+            len(block) == BLOCK_BYTES,
+            "truncated-header",
+            f"expected an END card; the file stops after {len(raw)} bytes of this header: copy the file again",
+        )
+    raise HeaderError(
+        "header-too-long",
         f"expected at most {limits.max_header_bytes} bytes of headers, each with an END card; got more: write the image "
-        "into a file of its own, with fewer cards"
+        "into a file of its own, with fewer cards",
     )
-    raise HeaderError("header-too-long", message)
 
 
 def _find_end(block: bytes) -> int | None:
@@ -305,27 +336,26 @@ def _find_end(block: bytes) -> int | None:
         if block[at : at + CARD_BYTES] == END_CARD:
             return at
         if _DAMAGED_END.match(block, at):
-            got = block[at : at + CARD_BYTES].rstrip()
-            raise bad_card("END followed by 77 spaces", f"{got!r:.100}")
+            raise bad_card("END followed by 77 spaces", f"{block[at : at + CARD_BYTES].rstrip()!r:.100}")
     return None
 
 
 def _check_start(block: bytes) -> None:
     if block.startswith(b"SIMPLE  ="):
         return
-    if not block:
-        raise HeaderError(
-            "empty-file", "expected a FITS file; got a gzip file with no content: copy the file again"
-        )
-    if block.startswith(b"SIMPLE"[: len(block)]) and len(block) < 9:
-        raise HeaderError(
-            "truncated-header",
-            f"expected a FITS header; the file stops after {len(block)} bytes: copy the file again",
-        )
-    got = next((name for start, name in _KNOWN_STARTS if block.startswith(start)), None)
-    if got is None:
-        text = all(byte in b"\t\r\n" or 32 <= byte < 127 for byte in block[:256])
-        got = "a text file" if text else f"bytes {block[:8]!r}"
+    check_header(
+        block != b"",
+        "empty-file",
+        "expected a FITS file; got a gzip file with no content: copy the file again",
+    )
+    check_header(
+        len(block) >= 9 or not block.startswith(b"SIMPLE"[: len(block)]),
+        "truncated-header",
+        f"expected a FITS header; the file stops after {len(block)} bytes: copy the file again",
+    )
+    is_text = all(byte in b"\t\r\n" or 32 <= byte < 127 for byte in block[:256])
+    unknown = "a text file" if is_text else f"bytes {block[:8]!r}"
+    got = next((name for start, name in _KNOWN_STARTS if block.startswith(start)), unknown)
     raise HeaderError("not-fits", f"expected a FITS file, which starts with 'SIMPLE  ='; got {got}")
 
 
@@ -357,47 +387,20 @@ def _check_image(header: Header, limits: FitsLimits) -> None:
     """Raise HeaderError if size, codec or tiles of an image are not allowed."""
     z = "Z" if card_flag(header, "ZIMAGE") else ""
     bitpix = card_count(header, f"{z}BITPIX", smallest=-64, largest=64)
-    if bitpix not in _BITPIX:
-        raise bad_card(f"{z}BITPIX of {_BITPIX}", bitpix)
+    check_card(bitpix in _BITPIX, f"{z}BITPIX of {_BITPIX}", bitpix)
     nx, ny = (card_count(header, f"{z}NAXIS{axis}") for axis in (1, 2))
-    if nx == 0 or ny == 0:
-        raise HeaderError(
-            "zero-size", f"expected at least one pixel on each axis; got {nx} x {ny}: use another image"
-        )
+    check_header(
+        nx > 0 and ny > 0,
+        "zero-size",
+        f"expected at least one pixel on each axis; got {nx} x {ny}: use another image",
+    )
     if nx * ny > limits.max_pixels:
-        message = (
-            f"expected at most {limits.max_pixels} pixels; got {nx} x {ny} = {nx * ny}: use a smaller image"
+        raise HeaderError(
+            "too-many-pixels",
+            f"expected at most {limits.max_pixels} pixels; got {nx} x {ny} = {nx * ny}: use a smaller image",
         )
-        raise HeaderError("too-many-pixels", message)
     if z:
         check_compression(header, nx, ny)
-        return
-    # The data of an image contain its pixels alone (FITS standard 4.0, section 7.1.1).
-    for key, value in (("PCOUNT", 0), ("GCOUNT", 1)):
-        card_count(header, key, smallest=value, largest=value, default=value)
-
-
-def _data_bytes(header: Header, hdu: int) -> int:
-    """Declared size of the data, FITS standard Eq. (2): |BITPIX| / 8 * GCOUNT * (PCOUNT + prod NAXISn)."""
-    bitpix = card_count(header, "BITPIX", smallest=-64, largest=64)
-    if bitpix not in _BITPIX:
-        raise bad_card(f"BITPIX of {_BITPIX} in HDU {hdu}", bitpix)
-    axes = card_count(header, "NAXIS", largest=999)
-    if axes == 0:
-        return 0
-    if hdu == 0 and card_flag(header, "GROUPS"):
-        message = (
-            "expected an image in a primary array or an image extension; got random groups (GROUPS = T): write the "
-            "image into a primary array without the card GROUPS"
-        )
-        raise HeaderError("random-groups", message)
-    elements = math.prod(card_count(header, f"NAXIS{axis}") for axis in range(1, axes + 1))
-    groups, extra = card_count(header, "GCOUNT", default=1), card_count(header, "PCOUNT", default=0)
-    size = abs(bitpix) // 8 * groups * (extra + elements)
-    if size > LARGEST_COUNT:
-        raise HeaderError(
-            "bad-card",
-            f"expected a data size below 2^63 bytes in HDU {hdu}; its header declares {size:.3g} bytes: copy or "
-            "make the file again",
-        )
-    return size
+    else:  # the data of an image contain its pixels alone (FITS standard 4.0, section 7.1.1)
+        for key, value in (("PCOUNT", 0), ("GCOUNT", 1)):
+            card_count(header, key, smallest=value, largest=value, default=value)

@@ -7,6 +7,7 @@ IAU FITS working group 2018), section 4.4.
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from decimal import Decimal
 from functools import cache
 from typing import TYPE_CHECKING, Any, Protocol
@@ -28,7 +29,6 @@ class Cards(Protocol):
 
     def __getitem__(self, key: str, /) -> Any:
         """The value of a card. Raises KeyError if there is no such card."""
-        ...
 
 
 @cache
@@ -44,19 +44,30 @@ def bad_card(expected: str, got: object) -> HeaderError:
     return HeaderError("bad-card", f"expected {expected}; got {got}: copy or make the file again")
 
 
+def check_card(good: bool, expected: str, got: object) -> None:
+    """Raise `bad_card` unless a card is good."""
+    if not good:
+        raise bad_card(expected, got)
+
+
+def check_header(good: bool, code: str, message: str) -> None:
+    """Raise HeaderError with this code and message unless a header is good."""
+    if not good:
+        raise HeaderError(code, message)
+
+
 def card_value(header: Header, key: str) -> object:
     """The value of a structural card, or None. Raises HeaderError if the card is unreadable or occurs more than once."""
-    try:
-        if header.count(key) > 1:
-            raise bad_card(f"card {key} once", f"it {header.count(key)} times")
-        return header[key]
-    except KeyError:
+    if key not in header:
         return None
-    except HeaderError:
-        raise
+    check_card(header.count(key) == 1, f"card {key} once", f"it {header.count(key)} times")
+    try:
+        return header[key]
     except card_trouble():
-        message = f"expected a readable card {key}; its value cannot be read: copy or make the file again"
-        raise HeaderError("bad-card", message) from None
+        raise HeaderError(
+            "bad-card",
+            f"expected a readable card {key}; its value cannot be read: copy or make the file again",
+        ) from None
 
 
 def card_count(
@@ -87,11 +98,16 @@ def optional_text(header: Cards, *keys: str) -> str | None:
 
     Surrounding spaces are removed.
     """
+    values = (lenient_value(header, key) for key in keys)
+    return next((value.strip() for value in values if isinstance(value, str) and value.strip()), None)
+
+
+def without_cards(header: Header, keys: Iterable[str]) -> Header:
+    """A copy of a header without the cards with these keywords."""
+    kept = header.copy()
     for key in keys:
-        value = lenient_value(header, key)
-        if isinstance(value, str) and value.strip():
-            return value.strip()
-    return None
+        kept.remove(key, ignore_missing=True, remove_all=True)
+    return kept
 
 
 def plain_value(value: object) -> object:
@@ -107,9 +123,7 @@ def long_key(key: str) -> str:
 def number_of(value: object, *, text: bool = True) -> float | None:
     """A finite number, as a card, a table in memory or numpy holds it; None for anything else. text: also a number as text."""
     if isinstance(value, str):
-        if not text or not _NUMBER.fullmatch(value.strip()):
-            return None
-        value = float(re.sub("[dD]", "e", value))
+        value = float(re.sub("[dD]", "e", value)) if text and _NUMBER.fullmatch(value.strip()) else None
     value = plain_value(value)
     if isinstance(value, bool) or not isinstance(value, (int, float, Decimal)):
         return None
@@ -125,10 +139,8 @@ def optional_number(header: Cards, *keys: str) -> float | None:
 def optional_value(header: Cards, key: str) -> str | float | bool | None:
     """The value of a card: True or False, a finite number, or a text without surrounding spaces; otherwise None."""
     value = lenient_value(header, key)
-    if isinstance(value, bool):
-        return value
-    number = number_of(value, text=False)
-    return optional_text(header, key) if number is None else number
+    plain = value if isinstance(value, bool) else number_of(value, text=False)
+    return optional_text(header, key) if plain is None else plain
 
 
 def lenient_value(header: Cards, key: str) -> object:
@@ -139,3 +151,8 @@ def lenient_value(header: Cards, key: str) -> object:
         return None
     except card_trouble():
         return None
+
+
+def history_of(header: Cards) -> str:
+    """The lines of HISTORY; empty if there are none."""
+    return str(lenient_value(header, "HISTORY") or "")

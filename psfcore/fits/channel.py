@@ -33,15 +33,24 @@ class Origin(Protocol):
     """The properties of a PSF that are compared with an image header. `psfcore.psf.Psf` has these properties."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """Its name, for messages."""
+
     @property
-    def instrument(self) -> str | None: ...
+    def instrument(self) -> str | None:
+        """The name of its instrument."""
+
     @property
-    def wavelength_angstrom(self) -> float | None: ...
+    def wavelength_angstrom(self) -> float | None:
+        """Its wavelength; None: that of the instrument."""
+
     @property
-    def plate_scale_arcsec(self) -> float | None: ...
+    def plate_scale_arcsec(self) -> float | None:
+        """The plate scale of its pixels, arcsec/px."""
+
     @property
-    def cards(self) -> Mapping[str, str]: ...
+    def cards(self) -> Mapping[str, str]:
+        """The cards of the images for which it is valid."""
 
 
 def check_channel(psf: Origin, header: Cards, *, other_channel: bool = False) -> str | None:
@@ -62,23 +71,21 @@ def check_channel(psf: Origin, header: Cards, *, other_channel: bool = False) ->
         )
     if differences:
         return f"the PSF is of another channel than the image: {'; '.join(differences)}"
-    silent = [
-        name
-        for name, angstrom in (("PSF", _psf_wavelength(psf)), ("image", _image_wavelength(header)))
-        if not angstrom
-    ]
-    if silent:
-        return f"the channels of image and PSF were not compared: {' and '.join(silent)} without wavelength (WAVELNTH)"
-    return None
+    silent = [name for name, angstrom in _wavelengths(psf, header).items() if not angstrom]
+    words = " and ".join(silent)
+    return (
+        f"the channels of image and PSF were not compared: {words} without wavelength (WAVELNTH)"
+        if silent
+        else None
+    )
 
 
 def channel_differences(psf: Origin, header: Cards) -> list[str]:
     """The differences between the PSF and an image with this header; one text for each difference."""
     differences = []
-    instrument = _other_instrument(psf, header)
-    if instrument is not None:
+    if (instrument := _other_instrument(psf, header)) is not None:
         differences.append(f"the image is of {instrument}, the PSF of {psf.instrument}")
-    image_angstrom, psf_angstrom = _image_wavelength(header), _psf_wavelength(psf)
+    psf_angstrom, image_angstrom = _wavelengths(psf, header).values()
     if image_angstrom and psf_angstrom and abs(image_angstrom / psf_angstrom - 1) > WAVELENGTH_TOLERANCE:
         differences.append(
             f"the image is of {image_angstrom:g} angstrom, the PSF of {psf_angstrom:g} angstrom"
@@ -101,24 +108,23 @@ def _other_instrument(psf: Origin, header: Cards) -> str | None:
     # instrument.
     matches = {key: text for key, text in match_table(psf.instrument).items() if isinstance(text, str)}
     cards = {key: optional_text(header, key) for key in ("TELESCOP", "OBSRVTRY", "INSTRUME", "DETECTOR")}
-    named = " ".join(text for text in cards.values() if text)
     compared = [_same_words(text, matches[key]) for key, text in cards.items() if text and key in matches]
-    return named or None if matches and not (compared and all(compared)) else None
+    same = not matches or (compared and all(compared))
+    return None if same else " ".join(text for text in cards.values() if text) or None
 
 
-def _image_wavelength(header: Cards) -> float | None:
-    """Wavelength in angstrom, from the header or else from the file of the known instrument; None if neither gives
-    it."""
-    angstrom, instrument = wavelength_angstrom(header), known_instrument(header)
-    if angstrom is None and instrument is not None:
-        return load_instrument(instrument).wavelength_angstrom
-    return angstrom
-
-
-def _psf_wavelength(psf: Origin) -> float | None:
-    if psf.wavelength_angstrom is None and psf.instrument in instrument_names():
-        return load_instrument(psf.instrument).wavelength_angstrom
-    return psf.wavelength_angstrom
+def _wavelengths(psf: Origin, header: Cards) -> dict[str, float | None]:
+    """Wavelengths in angstrom of the PSF and the image: as they give it, or else of their instruments; None if neither gives it."""
+    given = {
+        "PSF": (psf.wavelength_angstrom, psf.instrument),
+        "image": (wavelength_angstrom(header), known_instrument(header)),
+    }
+    return {
+        name: load_instrument(instrument).wavelength_angstrom
+        if angstrom is None and instrument in instrument_names()
+        else angstrom
+        for name, (angstrom, instrument) in given.items()
+    }
 
 
 def _same_words(one: str, other: str) -> bool:

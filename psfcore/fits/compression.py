@@ -18,8 +18,7 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from psfcore.errors import HeaderError
-from psfcore.fits.cards import bad_card, card_count, card_text, card_value
+from psfcore.fits.cards import bad_card, card_count, card_text, card_value, check_card, check_header
 
 if TYPE_CHECKING:
     from astropy.io.fits import Header
@@ -33,9 +32,10 @@ ALLOWED_CODECS = ("RICE_1", "GZIP_1", "GZIP_2", "NOCOMPRESS")
 MOST_TILES = 65_536  # astropy decodes tile by tile in Python, about 0.1 ms each
 COMPRESSED, GZIPPED, UNCOMPRESSED = "COMPRESSED_DATA", "GZIP_COMPRESSED_DATA", "UNCOMPRESSED_DATA"
 _RICE_BYTEPIX, _RICE_BLOCKSIZE = (1, 2, 4), (16, 32)  # section 10.4.1
+_SETTINGS = ("BLOCKSIZE", "BYTEPIX", "NOISEBIT", "SCALE", "SMOOTH")
 _DITHERS = ("SUBTRACTIVE_DITHER_1", "SUBTRACTIVE_DITHER_2")
 _NO_DITHERS = (None, "NO_DITHER", "NONE")
-_DITHER_SEEDS = 1, 10_000  # section 10.2: the values of ZDITHER0
+_LARGEST_SEED = 10_000  # section 10.2: the largest value of ZDITHER0
 _LARGEST_INT = 2**31 - 1
 _ITEMS_OF = {COMPRESSED: "BIJ", GZIPPED: "BIJ", UNCOMPRESSED: "BIJED"}
 _NUMBERS_OF = {"ZSCALE": "ED", "ZZERO": "ED", "ZBLANK": "BIJ"}
@@ -88,8 +88,7 @@ def read_columns(header: Header) -> list[Column]:
         form = None if text is None else _FORM.fullmatch(text.upper())
         if form is None or (form[2] in "PQ") != bool(form[3]):
             raise bad_card(f"TFORM{number} to be a binary format", f"{text!r:.40}")
-        if name in names:
-            raise bad_card("each column once", f"{name:.40} again as column {number}")
+        check_card(name not in names, "each column once", f"{name:.40} again as column {number}")
         names.add(name)
         columns.append(Column(name, int(form[1] or 1), form[2], form[3]))
     row_bytes = sum(column.row_bytes for column in columns)
@@ -103,14 +102,14 @@ def check_compression(header: Header, nx: int, ny: int) -> None:
     Raises HeaderError "codec-not-allowed", "bad-tiles", "bad-card".
     """
     codec = card_text(header, "ZCMPTYPE")
-    if codec not in ALLOWED_CODECS:
-        message = f"expected compression by one of {', '.join(ALLOWED_CODECS)}; got {codec}: decompress the file (funpack)"
-        raise HeaderError("codec-not-allowed", message)
+    check_header(
+        codec in ALLOWED_CODECS,
+        "codec-not-allowed",
+        f"expected compression by one of {', '.join(ALLOWED_CODECS)}; got {codec}: decompress the file (funpack)",
+    )
     _check_keywords(header)
     _check_tiling(header, nx, ny)
-    settings = _settings(header)
-    if codec == "RICE_1":
-        _check_rice(settings, card_count(header, "ZBITPIX", smallest=-64, largest=64))
+    _check_settings(header, codec)
     _check_columns(header)
     _check_dither(header)
     _check_heap(header)
@@ -135,79 +134,89 @@ def _check_keywords(header: Header) -> None:
 
 def _check_tiling(header: Header, nx: int, ny: int) -> None:
     tile_x, tile_y = card_count(header, "ZTILE1", default=nx), card_count(header, "ZTILE2", default=1)
-    if not (1 <= tile_x <= _LARGEST_INT and 1 <= tile_y <= _LARGEST_INT):
-        expected = f"expected tiles of 1 to {_LARGEST_INT} pixels on each axis"
-        raise HeaderError("bad-tiles", f"{expected}; got {tile_x} x {tile_y}: copy or make the file again")
+    check_header(
+        1 <= tile_x <= _LARGEST_INT and 1 <= tile_y <= _LARGEST_INT,
+        "bad-tiles",
+        f"expected tiles of 1 to {_LARGEST_INT} pixels on each axis; got {tile_x} x {tile_y}: copy or make the file again",
+    )
     tiles = math.prod(-(-n // tile) for n, tile in ((nx, tile_x), (ny, tile_y)))
     rows = card_count(header, "NAXIS2")
-    if rows != tiles:
-        message = (
-            f"expected one table row per tile, {tiles} rows for {nx} x {ny} pixels; got {rows}: copy or make the file "
-            "again"
-        )
-        raise HeaderError("bad-tiles", message)
-    if tiles > MOST_TILES:
-        raise HeaderError("bad-tiles", f"expected at most {MOST_TILES} tiles; got {tiles}: use larger tiles")
+    check_header(
+        rows == tiles,
+        "bad-tiles",
+        f"expected one table row per tile, {tiles} rows for {nx} x {ny} pixels; got {rows}: copy or make the file "
+        "again",
+    )
+    check_header(
+        tiles <= MOST_TILES,
+        "bad-tiles",
+        f"expected at most {MOST_TILES} tiles; got {tiles}: use larger tiles",
+    )
 
 
-def _settings(header: Header) -> dict[str, object]:
-    """The parameters ZNAMEn = ZVALn of the codec, by name in capitals. Each name may occur once."""
+def _check_settings(header: Header, codec: str | None) -> None:
+    """Check the parameters ZNAMEn = ZVALn of the codec. Each name may occur once."""
     settings: dict[str, object] = {}
     for number in range(1, MOST_COLUMNS + 1):
         if card_value(header, f"ZNAME{number}") is None:
             break
         name = (card_text(header, f"ZNAME{number}") or "").upper()
         value = card_value(header, f"ZVAL{number}")
-        names = {"BYTEPIX", "BLOCKSIZE", "SCALE", "SMOOTH", "NOISEBIT"}
-        if name not in names or name in settings:
-            raise bad_card(f"ZNAME{number} of {', '.join(sorted(names))}, each once", f"{name!r:.40}")
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= _LARGEST_INT:
-            raise bad_card(f"a number in ZVAL{number} ({name})", f"{value!r:.40}")
+        check_card(
+            name in _SETTINGS and name not in settings,
+            f"ZNAME{number} of {', '.join(_SETTINGS)}, each once",
+            f"{name!r:.40}",
+        )
+        check_card(
+            isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= _LARGEST_INT,
+            f"a number in ZVAL{number} ({name})",
+            f"{value!r:.40}",
+        )
         settings[name] = value
-    return settings
+    if codec == "RICE_1":
+        _check_rice(settings, card_count(header, "ZBITPIX", smallest=-64, largest=64))
 
 
 def _check_rice(settings: dict[str, object], bitpix: int) -> None:
     for name, allowed in (("BYTEPIX", _RICE_BYTEPIX), ("BLOCKSIZE", _RICE_BLOCKSIZE)):
         value = settings.get(name, allowed[0])
-        if not isinstance(value, int) or value not in allowed:
-            raise bad_card(f"{name} of {allowed} for RICE_1", f"{value!r:.40}")
-    most = abs(bitpix) // 8
-    if settings.get("BYTEPIX", 0) > most:  # type: ignore[operator]
-        expected = f"BYTEPIX of at most {most}, the bytes of a pixel with ZBITPIX = {bitpix}"
-        raise bad_card(expected, settings["BYTEPIX"])
+        check_card(
+            isinstance(value, int) and value in allowed, f"{name} of {allowed} for RICE_1", f"{value!r:.40}"
+        )
+    most, stored = abs(bitpix) // 8, settings.get("BYTEPIX", 0)
+    check_card(
+        stored <= most,  # type: ignore[operator]
+        f"BYTEPIX of at most {most}, the bytes of a pixel with ZBITPIX = {bitpix}",
+        stored,
+    )
 
 
 def _check_columns(header: Header) -> None:
     columns = read_columns(header)
     for number, column in enumerate(columns, start=1):
-        if column.name in _ITEMS_OF:
-            expected = f"1P or 1Q of {', '.join(_ITEMS_OF[column.name])}"
-            good = column.in_heap and column.repeat == 1 and column.item in _ITEMS_OF[column.name]
-        else:
-            expected = f"one number of {', '.join(_NUMBERS_OF.get(column.name, _NUMBERS))}"
-            good = column.repeat == 1 and column.form in _NUMBERS_OF.get(column.name, _NUMBERS)
-        if not good:
-            raise bad_card(f"column {column.name:.40} as {expected}", column)
-        for key in ("TSCAL", "TZERO", "TDIM"):
-            if card_value(header, f"{key}{number}") is not None:
-                raise bad_card(f"no card {key}{number} in a compressed image", "one")
+        is_data = column.name in _ITEMS_OF
+        types = _ITEMS_OF[column.name] if is_data else _NUMBERS_OF.get(column.name, _NUMBERS)
+        expected = f"{'1P or 1Q' if is_data else 'one number'} of {', '.join(types)}"
+        check_card(
+            column.repeat == 1 and column.in_heap == is_data and (column.item or column.form) in types,
+            f"column {column.name:.40} as {expected}",
+            column,
+        )
+        for key in (f"TSCAL{number}", f"TZERO{number}", f"TDIM{number}"):
+            check_card(card_value(header, key) is None, f"no card {key} in a compressed image", "one")
     names = {column.name for column in columns}
-    if COMPRESSED not in names:
-        raise bad_card(f"a column {COMPRESSED} in a compressed image", "none")
-    if ("ZSCALE" in names) != ("ZZERO" in names):
-        raise bad_card("both columns ZSCALE and ZZERO, or neither", "one of them")
+    check_card(COMPRESSED in names, f"a column {COMPRESSED} in a compressed image", "none")
+    check_card(
+        ("ZSCALE" in names) == ("ZZERO" in names), "both columns ZSCALE and ZZERO, or neither", "one of them"
+    )
 
 
 def _check_dither(header: Header) -> None:
     method = card_text(header, "ZQUANTIZ")
     if card_value(header, "ZQUANTIZ") is not None and method not in (*_DITHERS, *_NO_DITHERS):
         raise bad_card(f"ZQUANTIZ of {', '.join((*_DITHERS, 'NO_DITHER'))}", f"{method!r:.40}")
-    smallest, largest = _DITHER_SEEDS
-    if method in _DITHERS:
-        card_count(header, "ZDITHER0", smallest=smallest, largest=largest)
-    else:
-        card_count(header, "ZDITHER0", largest=largest, default=0)
+    smallest, default = (1, None) if method in _DITHERS else (0, 0)
+    card_count(header, "ZDITHER0", smallest=smallest, largest=_LARGEST_SEED, default=default)
     card_count(header, "ZBLANK", smallest=-_LARGEST_INT - 1, largest=_LARGEST_INT, default=0)
 
 

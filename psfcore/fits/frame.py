@@ -86,8 +86,6 @@ def frame_of(header: Cards) -> Frame:
         )
         for k in (1, 2)
     ]  # None: a unit that is no angle
-    if matrix is None:
-        return Frame((None, None), UNIT, roll_known=False, interpolated=_interpolated(header))
     (a, b), (c, d) = (
         tuple(one * (unit or 1.0) for one in row) for row, unit in zip(matrix, units, strict=True)
     )
@@ -98,18 +96,19 @@ def frame_of(header: Cards) -> Frame:
     roll = _detector_roll_deg(header)
     cosine, sine = math.cos(math.radians(roll or 0.0)), math.sin(math.radians(roll or 0.0))
     a, b, c, d = a / x, b / y, c / x, d / y
-    on_detector = (
-        (cosine * a + sine * c, cosine * b + sine * d),
-        (cosine * c - sine * a, cosine * d - sine * b),
-    )  # Eq. (2)
-    return Frame(scales, on_detector, roll is not None, _interpolated(header))
+    return Frame(
+        scales,
+        # Eq. (2)
+        ((cosine * a + sine * c, cosine * b + sine * d), (cosine * c - sine * a, cosine * d - sine * b)),
+        roll is not None,
+        _interpolated(header),
+    )
 
 
-def _unit_without_card(header: Cards, matrix: Matrix | None) -> str:
+def _unit_without_card(header: Cards, matrix: Matrix) -> str:
     """The unit of an axis without CUNIT: degrees if the axes are celestial (FITS standard, section 8.2), but many headers mean arcsec."""
-    celestial = (optional_text(header, "CTYPE1") or "")[4:5] == "-"
-    fine = matrix is not None and max(abs(one) for row in matrix for one in row) < FINEST_ARCSEC
-    return "deg" if celestial and fine else "arcsec"
+    fine = max(abs(one) for row in matrix for one in row) < FINEST_ARCSEC
+    return "deg" if fine and (optional_text(header, "CTYPE1") or "")[4:5] == "-" else "arcsec"
 
 
 def plate_scale_arcsec(header: Cards, axis: int = 1) -> float | None:
@@ -117,15 +116,13 @@ def plate_scale_arcsec(header: Cards, axis: int = 1) -> float | None:
     return frame_of(header).scale_arcsec[axis - 1]
 
 
-def _matrix(header: Cards) -> Matrix | None:
-    """M of Eq. (1) in the units of the header; None if there are no such cards."""
-    (a, b), (c, d) = cd = [[optional_number(header, f"CD{i}_{j}") for j in (1, 2)] for i in (1, 2)]
+def _matrix(header: Cards) -> Matrix:
+    """M of Eq. (1) in the units of the header; zeros if there are no such cards."""
+    (a, b), (c, d) = [[optional_number(header, f"CD{i}_{j}") for j in (1, 2)] for i in (1, 2)]
     x, y = (optional_number(header, f"CDELT{i}") for i in (1, 2))
     if x is not None or y is not None:
         (a, b), (c, d) = _turn(header, x or 1.0, y or 1.0)
         return ((x or 0.0) * a, (x or 0.0) * b), ((y or 0.0) * c, (y or 0.0) * d)
-    if cd == [[None, None], [None, None]]:
-        return None
     return (a or 0.0, b or 0.0), (c or 0.0, d or 0.0)
 
 

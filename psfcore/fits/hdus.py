@@ -11,10 +11,11 @@ import math
 import re
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -66,17 +67,24 @@ PIXEL_TROUBLE = (
 
 @dataclass(frozen=True, eq=False)
 class StoredImage:
-    """Pixels [y, x] (float64) and header of an image, as its file has them.
+    """Pixels [y, x] (float64) and header of an image, as its file has them, and the number of its HDU.
 
-    others: the images that follow in the file, with their shapes, if they were asked for; without planes of products. damaged: whether
-    the card DATASUM contradicts the data.
+    bits: BITPIX of the image; None: unknown. others: the number, the name and the shape of each image that follows in the file, if
+    they were asked for; without planes of products. damaged: whether the card DATASUM contradicts the data.
     """
 
-    summary: HeaderSummary
+    number: int
+    bits: int | None
     pixels: NDArray[np.float64]
     header: fits.Header
-    others: tuple[tuple[Hdu, tuple[int, int]], ...] = ()
+    others: Sequence[tuple[int, str, tuple[int, ...]]] = ()
     damaged: bool = False
+
+
+def prepare_library() -> None:
+    """Let astropy write its first file, for which it makes another one to find out whether files can be mapped into memory."""
+    with TemporaryFile() as target:
+        fits.HDUList([fits.PrimaryHDU()]).writeto(target)
 
 
 def read_pixels(
@@ -88,7 +96,7 @@ def read_pixels(
     process of its own, and its header is that of the image. Raises HeaderError, DataError "unreadable-pixels", and OSError
     if the disk fails.
     """
-    further: list[tuple[Hdu, tuple[int, int]]] = []
+    further: list[tuple[int, str, tuple[int, ...]]] = []
     with open_source(Path(path), limits) as source:
         hdus = walk(source, limits)
         image = first_image(hdus, limits, hdu)
@@ -100,13 +108,19 @@ def read_pixels(
         with suppress(HeaderError):
             for one in hdus if others else ():
                 if one.kind == "image" and not is_plane(one):
-                    further.append((one, shape_of(one.header)))
+                    further.append((one.number, one.name, shape_of(one.header)))
     if plain is not None:
-        return StoredImage(summary, plain, header, tuple(further), sums.contradicts(header))
+        return StoredImage(image.number, summary.bitpix, plain, header, further, sums.contradicts(header))
     decoded, damaged = _decoded_pixels(path, summary, twice=may_hold_unwritten_memory(header))
-    # The header of the image is that of the table without the cards of its tiles.
-    header = fits.Header([card for card in header.cards if not TABLE_CARD.fullmatch(card.keyword)])
-    return StoredImage(summary, decoded, header, tuple(further), damaged)
+    return StoredImage(
+        image.number,
+        summary.bitpix,
+        decoded,
+        # The header of the image is that of the table without the cards of its tiles.
+        fits.Header([card for card in header.cards if not TABLE_CARD.fullmatch(card.keyword)]),
+        further,
+        damaged,
+    )
 
 
 class Sum32:
@@ -224,9 +238,10 @@ def readable_pixels(path: str | Path, part: str) -> Iterator[None]:
     except PIXEL_TROUBLE as error:
         if isinstance(error, OSError) and error.errno not in (None, errno.EINVAL):
             raise  # the disk caused the error; the content of a file causes others, such as a negative size
-        expected = f"expected readable pixels in {part} of {Path(path).name}"
-        message = f"{expected}; got: {error!s:.120}: copy or make the file again"
-        raise DataError("unreadable-pixels", message) from None
+        raise DataError(
+            "unreadable-pixels",
+            f"expected readable pixels in {part} of {Path(path).name}; got: {error!s:.120}: copy or make the file again",
+        ) from None
 
 
 def ascii_text(text: str) -> str:
@@ -237,9 +252,10 @@ def ascii_text(text: str) -> str:
 def as_written(hdu: Any) -> bool:
     """Whether an HDU is unchanged since `write_hdus` wrote it: its checksums are correct, and `write_hdus` computed
     them."""
-    sums = ("CHECKSUM", "DATASUM")
-    ours = all(key in hdu.header and hdu.header.comments[key] == _CHECKSUM_COMMENT for key in sums)
-    return ours and hdu.verify_datasum() == hdu.verify_checksum() == _RIGHT
+    ours = (
+        key in hdu.header and hdu.header.comments[key] == _CHECKSUM_COMMENT for key in ("CHECKSUM", "DATASUM")
+    )
+    return all(ours) and hdu.verify_datasum() == hdu.verify_checksum() == _RIGHT
 
 
 def write_hdus(path: str | Path, hdus: list[Any]) -> None:

@@ -15,14 +15,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from psfcore.errors import DataError
-from psfcore.fits.blocks import FitsLimits as FitsLimits
-from psfcore.fits.blocks import Hdu, first_image, open_source, skip_data, walk
-from psfcore.fits.cards import Cards, card_count, card_flag, card_text, card_trouble, lenient_value
-from psfcore.fits.cards import optional_number as optional_number
-from psfcore.fits.cards import optional_text as optional_text
-from psfcore.fits.cards import optional_value as optional_value
-from psfcore.fits.frame import frame_of
-from psfcore.fits.frame import plate_scale_arcsec as plate_scale_arcsec
+from psfcore.fits.blocks import FitsLimits, Hdu, first_image, open_source, skip_data, walk
+from psfcore.fits.cards import (
+    Cards,
+    card_count,
+    card_flag,
+    card_text,
+    card_trouble,
+    history_of,
+    lenient_value,
+    optional_number,
+    optional_text,
+    optional_value,
+)
+from psfcore.fits.frame import frame_of, plate_scale_arcsec
 from psfcore.instruments.files import match_instrument
 
 if TYPE_CHECKING:
@@ -38,13 +44,30 @@ _ANGSTROM_PER_UNIT = {
     "m": 1e10,
 }
 _DATE_ONLY = re.compile(r"\d{4}-\d\d-\d\d")
-_OLD_DATE = re.compile(r"(\d\d)/(\d\d)/(\d\d)")  # FITS before 1998: day, month, year - 1900
+_OLD_DATE = re.compile(r"\A(\d\d)/(\d\d)/(\d\d)\Z")  # FITS before 1998: day, month, year - 1900
 _LEAP_SECOND = re.compile(r"(.*T\d\d:\d\d):60(\.\d*)?(Z?)")
 # The content of a file, see `content_of`.
 IMAGE, PRODUCT, PSF, ELSEWHERE = "image", "product", "psf", "deconvolved elsewhere"
 _DECONVOLVED = re.compile(
     r"(?<!not )\bdeconvolved\b|_deconvol|richardson.?lucy|psf[ -]correct(ed|ion)", re.IGNORECASE
 )
+_TWICE = "use the original image, or allow a second deconvolution"
+_NOT_AGAIN = {
+    ELSEWHERE: (
+        "already-deconvolved",
+        "expected an image that was not deconvolved before; the HISTORY of its header says that other software deconvolved it: "
+        + _TWICE,
+    ),
+    PRODUCT: (
+        "already-deconvolved",
+        "expected an image that was not deconvolved before; the header (PSFID) says that heliopsf made it by deconvolution: "
+        + _TWICE,
+    ),
+    PSF: (
+        "psf-as-image",
+        "expected an image; the header (PSFSUM) says that the file is a PSF: name it as the PSF, or allow it to be deconvolved",
+    ),
+}
 # Names of filters. XRT has two filter wheels and one of the last two cards for each; the others have FILTER.
 FILTER_CARDS = ("FILTER", "EC_FW1_", "EC_FW2_")
 # The cards that are compared to find out whether a PSF and an image fit together.
@@ -138,8 +161,7 @@ def content_of(header: Header) -> str:
         return PRODUCT
     if "PSFSUM" in header:
         return PSF
-    history = str(lenient_value(header, "HISTORY") or "")
-    return ELSEWHERE if _DECONVOLVED.search(history) else IMAGE
+    return ELSEWHERE if _DECONVOLVED.search(history_of(header)) else IMAGE
 
 
 def check_not_deconvolved(content: str) -> None:
@@ -147,22 +169,9 @@ def check_not_deconvolved(content: str) -> None:
 
     Codes: "already-deconvolved" for a product and for an image that other software deconvolved, "psf-as-image" for a PSF.
     """
-    again = "(--again, in a request again = true)"
-    done_by = {
-        ELSEWHERE: "the HISTORY of its header says that other software deconvolved it: use the original image",
-        PRODUCT: "the header (PSFID) says that heliopsf made it by deconvolution: use the original image",
-    }
-    if content in done_by:
-        raise DataError(
-            "already-deconvolved",
-            f"expected an image that was not deconvolved before; {done_by[content]}, or allow a second deconvolution {again}",
-        )
-    if content == PSF:
-        raise DataError(
-            "psf-as-image",
-            "expected an image; the header (PSFSUM) says that the file is a PSF: name it as the PSF, or allow it to be "
-            f"deconvolved {again}",
-        )
+    if content in _NOT_AGAIN:
+        code, message = _NOT_AGAIN[content]
+        raise DataError(code, f"{message} (--again, in a request again = true)")
 
 
 def origin_of(header: Cards) -> tuple[str | None, dict[str, str]]:
@@ -174,8 +183,7 @@ def origin_of(header: Cards) -> tuple[str | None, dict[str, str]]:
     """
     own = optional_text(header, "PSFNAME") is not None
     texts = {key: optional_text(header, key) for key in ORIGIN_CARDS}
-    named = texts["INSTRUME"] if own else known_instrument(header)
-    return named, {
+    return texts["INSTRUME"] if own else known_instrument(header), {
         key: text for key, text in texts.items() if text is not None and not (own and key == "INSTRUME")
     }
 
@@ -198,18 +206,16 @@ def wavelength_angstrom(header: Cards) -> float | None:
 
 def known_instrument(header: Cards) -> str | None:
     """Name of the shipped instrument whose table [match] agrees with this header; None if there is none."""
-    cards: dict[str, object] = {key: optional_text(header, key) for key in ORIGIN_CARDS}
-    cards |= {"WAVELNTH": wavelength_angstrom(header), "CDELT1": plate_scale_arcsec(header)}
-    return match_instrument(cards)
+    texts = {key: optional_text(header, key) for key in ORIGIN_CARDS}
+    return match_instrument(
+        {**texts, "WAVELNTH": wavelength_angstrom(header), "CDELT1": plate_scale_arcsec(header)}
+    )
 
 
 def optional_exposure_s(header: Cards) -> float | None:
     """The exposure time in s: the value of XPOSURE, or else of EXPTIME. None if neither card holds a number above zero."""
-    for key in ("XPOSURE", "EXPTIME"):
-        exposure = optional_number(header, key)
-        if exposure is not None and exposure > 0:
-            return exposure
-    return None
+    exposures = (optional_number(header, key) or 0.0 for key in ("XPOSURE", "EXPTIME"))
+    return next((exposure for exposure in exposures if exposure > 0), None)
 
 
 def seen_by(header: Cards) -> dict[str, Any]:
@@ -246,11 +252,10 @@ def summary_of(image: Hdu, *, gzipped: bool) -> HeaderSummary:
     """The summary of an HDU that `first_image` chose. gzipped: whether the file is compressed as a whole."""
     header = image.header
     compressed = card_flag(header, "ZIMAGE")
-    z = "Z" if compressed else ""
     return HeaderSummary(
         hdu=image.number,
         shape=shape_of(header),
-        bitpix=card_count(header, f"{z}BITPIX", smallest=-64, largest=64),
+        bitpix=card_count(header, "ZBITPIX" if compressed else "BITPIX", smallest=-64, largest=64),
         codec=card_text(header, "ZCMPTYPE") if compressed else None,
         gzipped=gzipped,
         **seen_by(header),
@@ -272,31 +277,26 @@ def observed_at(header: Cards) -> str | None:
     text = optional_text(header, "DATE-BEG", "DATE-OBS", "DATE_OBS")
     if text is None:
         return None
-    old = _OLD_DATE.fullmatch(text)
-    if old is not None:
-        text = f"19{old[3]}-{old[2]}-{old[1]}"
+    text = _OLD_DATE.sub(r"19\3-\2-\1", text)
     time = optional_text(header, "TIME-OBS", "TIME_OBS")
     if time is not None and _DATE_ONLY.fullmatch(text):
         text = f"{text}T{time}"
     scale = (optional_text(header, "TIMESYS") or "UTC").split()[0].upper()
     if scale in ("TAI", "TT"):
         return _in_utc(text, scale.lower())
-    if _LEAP_SECOND.fullmatch(text):
-        at = instant(text)
-        return text if at is None else at.replace(tzinfo=None).isoformat()
-    return text
+    at = instant(text) if _LEAP_SECOND.fullmatch(text) else None
+    return text if at is None else at.replace(tzinfo=None).isoformat()
 
 
 def instant(text: str) -> datetime | None:
     """The instant of a date. A date without a time zone is in UTC; a leap second is the first of the next minute. None if
     the date cannot be read."""
-    leap = _LEAP_SECOND.fullmatch(text)
+    leap, later = _LEAP_SECOND.fullmatch(text), timedelta()
+    if leap is not None:
+        text, later = f"{leap[1]}:00{leap[3]}", timedelta(seconds=60 + float(f"0{leap[2] or '.0'}"))
     try:
-        if leap is not None:
-            minute = instant(f"{leap[1]}:00{leap[3]}")
-            return None if minute is None else minute + timedelta(seconds=60 + float(f"0{leap[2] or '.0'}"))
-        at = datetime.fromisoformat(text)
-    except ValueError:
+        at = datetime.fromisoformat(text) + later
+    except (ValueError, OverflowError):
         return None
     return at if at.tzinfo is not None else at.replace(tzinfo=UTC)
 
@@ -340,8 +340,7 @@ def _shown(card: Card) -> tuple[str, JsonValue, str]:
     except card_trouble():
         # card.image is not used here: astropy would repair the card and warn, and Python keeps the text of every
         # warning.
-        text = str(card._image)[8:].removeprefix("=")
-        return str(card.keyword), text.strip(), ""
+        return str(card.keyword), str(card._image)[8:].removeprefix("=").strip(), ""
 
 
 def _json(value: object) -> JsonValue:

@@ -41,7 +41,14 @@ from numpy.typing import NDArray
 
 from psfcore.errors import DataError, module_of_extra
 from psfcore.fits.blocks import FitsLimits
-from psfcore.fits.cards import card_trouble, long_key, optional_number, optional_text, optional_value
+from psfcore.fits.cards import (
+    card_trouble,
+    long_key,
+    optional_number,
+    optional_text,
+    optional_value,
+    without_cards,
+)
 from psfcore.fits.hdus import TABLE_CARD, ascii_text, read_pixels, write_hdus
 from psfcore.fits.header import PRODUCT, content_of
 from psfcore.image import Image
@@ -109,13 +116,12 @@ def read_mask_image(path: Path) -> NDArray[np.float64]:
 
 
 def _png(path: Path) -> NDArray[np.float64]:
-    imread = module_of_extra("matplotlib.image").imread
     try:
-        picture = np.asarray(imread(path, format="png"), dtype=np.float64)
+        picture = np.asarray(module_of_extra("matplotlib.image").imread(path, format="png"), dtype=np.float64)
     except (OSError, ValueError, SyntaxError) as error:  # Pillow raises SyntaxError for a broken PNG
-        reason = " ".join(str(error).split())
         raise DataError(
-            "bad-mount", f"mount.mask_image.file: expected a PNG that can be read; got: {reason:.120}"
+            "bad-mount",
+            f"mount.mask_image.file: expected a PNG that can be read; got: {' '.join(str(error).split()):.120}",
         ) from None
     if picture.ndim == 3:
         colours = picture.shape[2] - 1 if picture.shape[2] in (2, 4) else picture.shape[2]
@@ -144,26 +150,28 @@ def write_image(
     pixels = image.pixels.astype(np.float32)
     finite = pixels[np.isfinite(pixels)]
     if finite.size:
-        header["DATAMIN"] = (float(finite.min()), "smallest finite pixel")
-        header["DATAMAX"] = (float(finite.max()), "largest finite pixel")
-        header["DATAMEAN"] = (float(finite.mean(dtype=np.float64)), "mean of finite pixels")
+        header.update(
+            {
+                "DATAMIN": (float(finite.min()), "smallest finite pixel"),
+                "DATAMAX": (float(finite.max()), "largest finite pixel"),
+                "DATAMEAN": (float(finite.mean(dtype=np.float64)), "mean of finite pixels"),
+            }
+        )
     header.update(_ascii(cards))
     for line in history:
         header.add_history(ascii_text(line))
     hdus: list[Any] = [fits.PrimaryHDU(pixels, header)]
     for name, plane in (planes or {}).items():
         _check_plane(name, plane, pixels.shape, taken=[hdu.name for hdu in hdus])
-        meanings = (plane_bits or {}).get(name)
-        hdus.append(_plane_hdu(name, plane, header, unit=image.unit, meanings=meanings))
+        hdus.append(_plane_hdu(name, plane, header, image.unit, (plane_bits or {}).get(name)))
     write_hdus(path, hdus)
 
 
 def write_plane(path: str | Path, pixels: NDArray[Any], *, cards: Cards) -> None:
     """Write pixels [y, x] and `cards` to a file. Integers are stored as int32, floats as float32."""
-    stored = pixels.astype(np.int32 if pixels.dtype.kind in "iu" else np.float32)
-    header = fits.Header()
-    header.update(_ascii(cards))
-    write_hdus(path, [fits.PrimaryHDU(stored, header)])
+    hdu = fits.PrimaryHDU(pixels.astype(np.int32 if pixels.dtype.kind in "iu" else np.float32))
+    hdu.header.update(_ascii(cards))
+    write_hdus(path, [hdu])
 
 
 def _ascii(cards: Cards) -> dict[str, tuple[CardValue, str]]:
@@ -174,7 +182,7 @@ def _ascii(cards: Cards) -> dict[str, tuple[CardValue, str]]:
 
 
 def _plane_hdu(
-    name: str, plane: NDArray[Any], image_header: fits.Header, *, unit: str | None, meanings: Meanings | None
+    name: str, plane: NDArray[Any], image_header: fits.Header, unit: str | None, meanings: Meanings | None
 ) -> fits.ImageHDU:
     """The HDU of a plane [y, x]. Bits are stored as uint8 or uint16, numbers as float32 in the unit of the image.
 
@@ -191,17 +199,19 @@ def _plane_hdu(
         hdu.header[f"QBIT{bit.bit_length() - 1}"] = (bit.name or "", f"value {int(bit)}: {meaning}")
     if meanings:
         hdu.header.add_comment("0 marks a good pixel; other values are sums of the values of QBITn.")
-    for card in image_header.cards:
-        if _PLACE_CARD.fullmatch(card.keyword):
-            hdu.header.append(card, end=True)
+    hdu.header.extend(
+        (card for card in image_header.cards if _PLACE_CARD.fullmatch(card.keyword)), strip=False, end=True
+    )
     return hdu
 
 
 def _check_plane(name: str, plane: NDArray[Any], shape: tuple[int, ...], *, taken: Sequence[str]) -> None:
     """Raise DataError "bad-plane" for a wrong shape or type, or a name that is not allowed or in `taken`."""
     if not re.fullmatch(r"[A-Z][A-Z0-9_]{0,31}", name) or name in taken:
-        message = f"expected a plane name in capitals, other than {', '.join(taken)}; got {name!r:.40}"
-        raise DataError("bad-plane", message)
+        raise DataError(
+            "bad-plane",
+            f"expected a plane name in capitals, other than {', '.join(taken)}; got {name!r:.40}",
+        )
     if plane.shape != shape:
         raise DataError("bad-plane", f"expected plane {name} to have {shape} pixels; got {plane.shape}")
     if plane.dtype.kind not in "ubf" or (plane.dtype.kind == "u" and plane.dtype.itemsize > 2):
@@ -212,13 +222,11 @@ def _kept_header(source: fits.Header) -> fits.Header:
     """The input's cards in order, without the cards of _STORAGE_CARD. An unreadable card becomes a HISTORY card."""
     kept = fits.Header()
     for card in source.cards:
-        if _STORAGE_CARD.fullmatch(card.keyword):
-            continue
-        readable = _readable(card)
-        if readable is None:
-            kept.add_history(_as_text(card))
-        else:
-            kept.append(readable, end=True)
+        if not _STORAGE_CARD.fullmatch(card.keyword):
+            try:
+                kept.append(_readable(card), end=True)
+            except card_trouble():
+                kept.add_history(_as_text(card))
     return kept
 
 
@@ -231,22 +239,19 @@ def _as_text(card: fits.Card) -> str:
         return f"card {ascii_text(card.keyword)} left out: it cannot be read"
 
 
-def _readable(card: fits.Card) -> fits.Card | None:
-    """A copy of the card that can be written, or None if the card is unreadable.
+def _readable(card: fits.Card) -> fits.Card:
+    """A copy of the card that can be written. Raises the errors of `card_trouble` if the card is unreadable.
 
     A value that FITS does not allow (NaN, "1 2 3") becomes a string.
     """
-    try:
-        value = _card_value(card)
-        copy = fits.Card(
-            long_key(card.keyword),
-            ascii_text(value) if isinstance(value, str) else value,
-            ascii_text(card.comment),
-        )
-        copy.verify("silentfix")
-        fits.Card.fromstring(copy.image)
-    except card_trouble():
-        return None
+    value = _card_value(card)
+    copy = fits.Card(
+        long_key(card.keyword),
+        ascii_text(value) if isinstance(value, str) else value,
+        ascii_text(card.comment),
+    )
+    copy.verify("silentfix")
+    fits.Card.fromstring(copy.image)
     return copy
 
 
@@ -255,8 +260,7 @@ def _card_value(card: fits.Card) -> Any:
         value = card.value
     except VerifyError:
         value = fits.Card.fromstring(card.image).value  # card.image contains the value as a quoted string
-    not_a_number = isinstance(value, (float, complex)) and not np.isfinite(value)
-    return str(value) if not_a_number else value
+    return str(value) if isinstance(value, (float, complex)) and not np.isfinite(value) else value
 
 
 @dataclass(frozen=True)
@@ -277,29 +281,24 @@ def described(source: fits.Header, *, filename: str, creator: str, sha256: str) 
 
     filename: name of the product. sha256: hash of the input's file.
     """
-    before = {key: optional_value(source, key) for key in _OF_FILE}
     # A file name may fill the whole card, so cards with a file name have no comment.
     cards: dict[str, tuple[CardValue, str]] = {
         "FILENAME": (filename, ""),
         "CREATOR": (creator, "made this file"),
     }
-    parent = optional_text(source, "FILENAME")
-    if parent is not None:
+    if (parent := optional_text(source, "FILENAME")) is not None:
         cards["PARENT"] = (parent, "")
     if "LEVEL" in source:
         cards["LEVEL"] = (_LEVEL, "derived from calibrated data")
     passes = passes_of(source) + 1
     cards[CARD_OF_PASS] = (passes, "deconvolutions of this image, with this one")
-    kept = source.copy()
-    for key in _OF_FILE:
-        if key not in cards:
-            kept.remove(key, ignore_missing=True, remove_all=True)
-    history = ["SHA-256 of the input file:", sha256]
-    history += [
+    kept = without_cards(source, (key for key in _OF_FILE if key not in cards))
+    inputs = (
         f"input {key}: {value:g}" if isinstance(value, float) else f"input {key}: {value}"
-        for key, value in before.items()
-        if value is not None
-    ]
+        for key in _OF_FILE
+        if (value := optional_value(source, key)) is not None
+    )
+    history = ["SHA-256 of the input file:", sha256, *inputs]
     if passes > 1:
         history.append(f"deconvolution number {passes} of this image: the input was a product")
     return Described(kept, cards, history)
@@ -307,6 +306,4 @@ def described(source: fits.Header, *, filename: str, creator: str, sha256: str) 
 
 def passes_of(source: fits.Header) -> int:
     """How often the input was deconvolved; at least once if it is a product."""
-    if content_of(source) != PRODUCT:
-        return 0
-    return int(optional_number(source, CARD_OF_PASS) or 1)
+    return int(optional_number(source, CARD_OF_PASS) or 1) if content_of(source) == PRODUCT else 0

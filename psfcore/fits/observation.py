@@ -7,7 +7,7 @@ has one mask, one unit and one saturation level everywhere: from a file (`read_o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.cards import lenient_value, optional_number, optional_text
-from psfcore.fits.hdus import read_pixels
+from psfcore.fits.hdus import StoredImage, read_pixels
 from psfcore.fits.header import (
     IMAGE,
     check_not_deconvolved,
@@ -39,7 +39,6 @@ _KIND_CARDS = ("IMG_TYPE", "IMGTYPE", "IMAGETYP", "EC_IMTYP", "FRAMETYP", "OBS_T
 _HIDDEN = {"ACS_ECLP": "YES", "ACS_SUNP": "NO", "ECLIPSE": "1"}
 _NO_SUN = ("dark", "bias", "led", "flat", "calib", "offset", "pinhole")
 _FULL_SCALES = tuple(2**bits - 1 for bits in (8, 10, 12, 14, 15, 16))
-_Beside = Iterable[tuple[int, str, tuple[int, ...]]]  # number, name and shape of each further image
 
 
 def read_observation(
@@ -51,18 +50,9 @@ def read_observation(
     2-D image. Raises HeaderError for an unusable header; DataError "unreadable-pixels", and the errors of `observation_of`.
     """
     stored = read_pixels(path, limits, hdu=hdu, others=True)
-    beside = [(one.number, one.name, shape) for one, shape in stored.others]
-    image = _beside(
-        beside,
-        lambda number: read_pixels(path, limits, hdu=number).pixels,
-        stored.pixels,
-        stored.header,
-        bits=stored.summary.bitpix,
-        chosen=hdu,
-        number=stored.summary.hdu,
-        saturation_dn=saturation_dn,
+    return _with_planes(
+        stored, lambda number: read_pixels(path, limits, hdu=number).pixels, hdu, saturation_dn
     )
-    return image.warned(_damaged(stored.summary.hdu)) if stored.damaged else image
 
 
 def observation_of_hdus(
@@ -78,66 +68,56 @@ def observation_of_hdus(
     )  # before its pixels are read: astropy then removes the cards that tell lost pixels
     damaged = "data" not in vars(hdu) and hdu.verify_datasum() == 0
     pixels = np.asarray(hdu.data)
-    beside = [
+    others = [
         (n, str(one.name), one.shape)
         for n, one in hdus.items()
         if n > number and lenient_value(one.header, "PLANE") is not True
     ]
-    image = _beside(
-        beside,
-        lambda number: np.asarray(hdus[number].data),
-        real_pixels(pixels),
-        header,
-        bits=stored_bits(pixels, header),
-        chosen=chosen,
-        number=number,
-        saturation_dn=saturation_dn,
+    stored = StoredImage(
+        number, stored_bits(pixels, header), real_pixels(pixels), header, others, damaged=damaged
     )
-    return image.warned(_damaged(number)) if damaged else image
+    return _with_planes(stored, lambda number: np.asarray(hdus[number].data), chosen, saturation_dn)
 
 
-def _damaged(number: int) -> dict[str, str]:
-    return {
-        "damaged": f"DATASUM of HDU {number} does not agree with its pixels: the file was damaged or changed after it was written; copy it again"
-    }
-
-
-def _beside(
-    beside: _Beside,
+def _with_planes(
+    stored: StoredImage,
     read: Callable[[int], NDArray[Any]],
-    pixels: NDArray[np.float64],
-    header: Header,
-    *,
-    bits: int | None,
     chosen: int | None,
-    number: int,
     saturation_dn: float | None,
 ) -> Image:
-    """The image with its planes among the images `beside` it; a warning names the others. read(number): the pixels of one of them."""
+    """The image with its planes among the other images of the file. Warnings name the others, and damage.
+
+    read(number): the pixels of one of the others. chosen: the number of the HDU, if the caller named it.
+    """
     planes, others = {}, []
-    is_image = content_of(header) == IMAGE
-    for one, name, shape in beside:
+    is_image = content_of(stored.header) == IMAGE
+    for number, name, shape in stored.others:
         if name.upper() not in (*FLAGS, *ERRORS):
-            others.append(f"{one} ({name})" if name else str(one))
-        elif is_image and shape == pixels.shape:
-            planes[name.upper()] = read(one)
-    image = observation_of(pixels, header, bits=bits, planes=planes, saturation_dn=saturation_dn)
-    if not others or chosen is not None or not is_image:
-        return image
-    return image.warned(
-        {
-            "several-images": f"the file has {len(others) + 1} images; HDU {number} is used. --hdu (hdu in a request) "
-            f"takes another one: {', '.join(others[:5])}{', ...' if len(others) > 5 else ''}"
-        }
+            others.append(f"{number} ({name})" if name else str(number))
+        elif is_image and shape == stored.pixels.shape:
+            planes[name.upper()] = read(number)
+    image = observation_of(
+        stored.pixels, stored.header, bits=stored.bits, planes=planes, saturation_dn=saturation_dn
     )
+    warnings = {}
+    if others and chosen is None and is_image:
+        warnings["several-images"] = (
+            f"the file has {len(others) + 1} images; HDU {stored.number} is used. --hdu (hdu in a request) "
+            f"takes another one: {', '.join(others[:5])}{', ...' if len(others) > 5 else ''}"
+        )
+    if stored.damaged:
+        warnings["damaged"] = (
+            f"DATASUM of HDU {stored.number} does not agree with its pixels: the file was damaged or changed after it was written; "
+            "copy it again"
+        )
+    return image.warned(warnings) if warnings else image
 
 
 def stored_bits(data: NDArray[Any], header: Header) -> int | None:
     """BITPIX of an image in memory as it was stored: of its header, or of its whole numbers; None: not known."""
     stated = optional_number(header, "BITPIX")
-    if stated is not None:
-        return int(stated)
-    return 8 * data.dtype.itemsize if data.dtype.kind in "iu" else None
+    of_data = 8 * data.dtype.itemsize if data.dtype.kind in "iu" else None
+    return of_data if stated is None else int(stated)
 
 
 def real_pixels(data: NDArray[Any]) -> NDArray[np.float64]:
@@ -158,9 +138,7 @@ def check_exposure_of_sun(header: Header) -> None:
     check_not_deconvolved(content_of(header))
     for key in (*_KIND_CARDS, *_HIDDEN):
         number = optional_number(header, key)
-        kind = optional_text(header, key) if number is None else f"{number:g}"
-        if kind is None:
-            continue
+        kind = (optional_text(header, key) or "") if number is None else f"{number:g}"
         words = kind.lower().replace("_", " ").split()
         if kind.upper() == _HIDDEN.get(key) or (key in _KIND_CARDS and any(one in words for one in _NO_SUN)):
             raise DataError(
@@ -190,8 +168,9 @@ def observation_of(
     image = Image(pixels, mask, header, unit_of(header).text, optional_exposure_s(header), warnings=warnings)
     name = known_instrument(header)
     mode = None if name is None else load_instrument(name).gain_mode(optional_text(header, "GAINCOMB"))
-    of_instrument = None if mode is None else mode.saturation_dn
-    image = with_saturation(image, requested_dn=saturation_dn, instrument_dn=of_instrument)
+    image = with_saturation(
+        image, requested_dn=saturation_dn, instrument_dn=None if mode is None else mode.saturation_dn
+    )
     _check_signal(image, stored_as_integer=bits is not None and bits > 0)
     return image
 
@@ -203,15 +182,13 @@ def _range_of(pixels: NDArray[np.float64]) -> tuple[float, float]:
 def _check_signal(image: Image, *, stored_as_integer: bool) -> None:
     valid = image.valid
     if not valid.any():
-        finite = image.finite
-        if not finite.any():
+        if not image.finite.any():
             raise DataError(
                 "all-nan", "expected finite pixels; got only NaN, infinite or BLANK: use another image"
             )
-        level = image.pixels[finite].min()
         raise DataError(
             "all-saturated",
-            f"expected pixels below saturation; all finite pixels are at {level:g} or above: check the level",
+            f"expected pixels below saturation; all finite pixels are at {image.pixels[image.finite].min():g} or above: check the level",
         )
     whole = bool(valid.all())
     smallest, largest = _range_of(image.pixels if whole else image.pixels[image.finite])
@@ -226,6 +203,7 @@ def _check_signal(image: Image, *, stored_as_integer: bool) -> None:
     if smallest == largest <= 0 or abs(farthest) < 1 / LARGEST_PIXEL:
         raise DataError("no-signal", f"expected light; the brightest pixel is {largest:g}: use another image")
     if smallest == largest and stored_as_integer and largest in _FULL_SCALES:
-        text = f"all pixels are {largest:g}, the largest value of an A/D converter"
-        message = f"expected pixels below saturation; {text}: use another image"
-        raise DataError("all-saturated", message)
+        raise DataError(
+            "all-saturated",
+            f"expected pixels below saturation; all pixels are {largest:g}, the largest value of an A/D converter: use another image",
+        )

@@ -45,9 +45,9 @@ def write_psf(path: str | Path, psf: Psf, *, instrument_file: bytes | None = Non
     if psf.fitted is not None:
         hdus.append(_fitted_hdu(psf.fitted))
     if instrument_file is not None:
-        values = np.frombuffer(instrument_file, dtype=np.uint8)[None]
-        column = fits.Column(name="TOML", format=f"{values.size}B", array=values)
-        hdus.append(fits.BinTableHDU.from_columns([column], name="INSTRUMENT"))
+        text = np.frombuffer(instrument_file, dtype=np.uint8)[None]
+        columns = [fits.Column(name="TOML", format=f"{text.size}B", array=text)]
+        hdus.append(fits.BinTableHDU.from_columns(columns, name="INSTRUMENT"))
     write_hdus(path, hdus)
 
 
@@ -57,12 +57,15 @@ def write_kernel(path: str | Path, psf: Psf) -> None:
 
 
 def _psf_header(psf: Psf) -> fits.Header:
-    header = fits.Header()
-    header["PSFNAME"] = (ascii_text(psf.name), "name of this point-spread function")
-    header["PSFVERS"] = (ascii_text(psf.version), "its version")
-    header["PSFSTAT"] = (ascii_text(psf.status), "draft or released")
-    header["PSFSUM"] = (psf.total, "sum of weights on this array")
-    header["REACH"] = (psf.reach_px, "[pixel] farthest pixel from the centre")
+    header = fits.Header(
+        [
+            ("PSFNAME", ascii_text(psf.name), "name of this point-spread function"),
+            ("PSFVERS", ascii_text(psf.version), "its version"),
+            ("PSFSTAT", ascii_text(psf.status), "draft or released"),
+            ("PSFSUM", psf.total, "sum of weights on this array"),
+            ("REACH", psf.reach_px, "[pixel] farthest pixel from the centre"),
+        ]
+    )
     if psf.instrument is not None:
         header["INSTRUME"] = (ascii_text(psf.instrument), "instrument description")
     for key, text in psf.cards.items():
@@ -112,13 +115,16 @@ def _profile_hdu(psf: Psf) -> fits.BinTableHDU:
 
 def _fitted_hdu(fitted: FittedShape) -> fits.BinTableHDU:
     """Table with one row for each parameter: its name, its fitted coordinate, and its row of the covariance matrix."""
-    count = len(fitted.parameters)
-    columns = [
-        fits.Column(name="parameter", format="16A", array=np.array(fitted.parameters)),
-        fits.Column(name="coordinate", format="D", array=np.array(fitted.coordinates)),
-        fits.Column(name="covariance", format=f"{count}D", array=np.array(fitted.covariance)),
-    ]
-    hdu = fits.BinTableHDU.from_columns(columns, name="FIT")
+    hdu = fits.BinTableHDU.from_columns(
+        [
+            fits.Column(name="parameter", format="16A", array=np.array(fitted.parameters)),
+            fits.Column(name="coordinate", format="D", array=np.array(fitted.coordinates)),
+            fits.Column(
+                name="covariance", format=f"{len(fitted.parameters)}D", array=np.array(fitted.covariance)
+            ),
+        ],
+        name="FIT",
+    )
     hdu.header["SHAPE"] = (ascii_text(fitted.shape), "formula that SCATTER was fitted with")
     return hdu
 
@@ -147,9 +153,8 @@ def read_psf(path: str | Path, limits: FitsLimits, *, parts: bool = True) -> Psf
     """
     stored = read_pixels(path, limits)
     kernel, header = stored.pixels, stored.header
-    own = "PSFNAME" in header
     components, provenance, fitted = (
-        _read_extras(path, limits, kernel.shape) if own and parts else ({}, {}, None)
+        _read_extras(path, limits, kernel.shape) if parts and "PSFNAME" in header else ({}, {}, None)
     )
     instrument, cards = origin_of(header)
     publication = {
@@ -187,12 +192,10 @@ def stated_id(path: str | Path, limits: FitsLimits) -> str | None:
             # `read_psf` keeps the HISTORY of a file under this name, and `write_psf` writes it into files derived from
             # it.
             derived = any(line.startswith("history:") for line in lines)
-            if len(stated) != 1 or derived:
-                return None
-            same = all(map(as_written, hdus))
+            good = len(stated) == 1 and not derived and all(map(as_written, hdus))
+            return stated[0] if good else None
     except PIXEL_TROUBLE:  # a damaged file, or one of other software; the job that uses it raises the error
         return None
-    return stated[0] if same else None
 
 
 def _read_extras(
@@ -211,17 +214,21 @@ def _read_extras(
             for hdu in hdus[1:]:
                 if isinstance(hdu, fits.ImageHDU) and hdu.shape == shape:
                     components[hdu.name] = np.array(hdu.data, dtype=np.float64)
-                elif not isinstance(hdu, fits.BinTableHDU) or _has_heap(hdu):
-                    continue
+                elif not isinstance(hdu, fits.BinTableHDU) or any(
+                    column.in_heap for column in read_columns(hdu.header)
+                ):
+                    continue  # the tables of write_psf have no data outside their rows
                 elif hdu.name == "INSTRUMENT":
-                    text = np.asarray(hdu.data["TOML"][0], dtype=np.uint8).tobytes()
-                    provenance["instrument_toml"] = text.decode("utf-8")
+                    provenance["instrument_toml"] = (
+                        np.asarray(hdu.data["TOML"][0], dtype=np.uint8).tobytes().decode("utf-8")
+                    )
                 elif hdu.name == "FIT":
                     fitted = _read_fitted(hdu)
     except PIXEL_TROUBLE as error:
-        expected = f"expected readable extensions in {Path(path).name}"
-        message = f"{expected}; got: {error!s:.120}: copy or make the file again"
-        raise DataError("unreadable-pixels", message) from None
+        raise DataError(
+            "unreadable-pixels",
+            f"expected readable extensions in {Path(path).name}; got: {error!s:.120}: copy or make the file again",
+        ) from None
     return components, provenance, fitted
 
 
@@ -233,8 +240,3 @@ def _first_hdus(path: str | Path, count: int) -> Iterator[list[Any]]:
     """
     with fits.open(path, memmap=False, disable_image_compression=True) as hdus:
         yield [hdus[number] for number in range(count)]
-
-
-def _has_heap(table: fits.BinTableHDU) -> bool:
-    """Whether data of a table lie outside its rows, as never in the files of write_psf."""
-    return any(column.in_heap for column in read_columns(table.header))

@@ -33,7 +33,7 @@ saturated pixels different from each other, the test cannot find these pixels.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,15 +56,6 @@ _LEVEL_CARDS = ("SATURATE", "DSATVAL", "SAT_THR")
 _SETTING = "set the level with saturation_dn (--saturation)"
 
 
-@dataclass(frozen=True)
-class _Level:
-    """A saturation level. value: in the unit of the image; None: it cannot be converted. source: see `Saturation.found`."""
-
-    value: float | None
-    source: str | None
-    warning: str | None = None
-
-
 def with_saturation(
     image: Image, *, requested_dn: float | None = None, instrument_dn: float | None = None
 ) -> Image:
@@ -76,34 +67,39 @@ def with_saturation(
     "saturation-unit" if the request gives a level and the unit of the image is neither counts nor a rate of counts, and "no-exposure".
     """
     level = _level(image, requested_dn, instrument_dn)
-    if level.source != REQUEST:
+    if level.found != REQUEST:
         level = _counted(image, level)
-    mask = image.mask if level.value is None else _masked(image, level.value)
-    value, source, warning = level.value, level.source, level.warning
+    mask = image.mask if level.level is None else _masked(image, level.level)
     if requested_dn is None:
         top, count, chance = largest_value(image.pixels, mask == 0)
-        confirmed = source in (*_LEVEL_CARDS, *_COUNTS) and bool(np.any(mask & MaskBit.SATURATED.value))
+        confirmed = level.found in (*_LEVEL_CARDS, *_COUNTS) and bool(np.any(mask & MaskBit.SATURATED.value))
         if chance < MASKED_BELOW and not confirmed:
-            if value is not None:
-                warning = (
-                    f"{count} pixels have the value {top:g}, the largest below the saturation level {value:g} "
-                    f"({source}); they are masked as saturated: if they are not, {_SETTING}"
-                )
-            source, value = PIXELS, top
-            mask = _masked(image, top)
-        elif chance < DOUBTED_BELOW:
-            warning = warning or (
-                f"{count} pixels have the largest value, {top:g}; they may be saturated, but are not masked: "
-                f"if they are saturated, {_SETTING}"
+            masked = (
+                f"{count} pixels have the value {top:g}, the largest below the saturation level {level.level:g} "
+                f"({level.found}); they are masked as saturated: if they are not, {_SETTING}"
+                if level.level is not None
+                else level.warning
             )
-    return replace(image, mask=mask, saturation=Saturation(value, None if value is None else source, warning))
+            level, mask = Saturation(top, PIXELS, masked), _masked(image, top)
+        elif chance < DOUBTED_BELOW and not level.warning:
+            level = replace(
+                level,
+                warning=f"{count} pixels have the largest value, {top:g}; they may be saturated, but are not masked: "
+                f"if they are saturated, {_SETTING}",
+            )
+    return replace(
+        image, mask=mask, saturation=level if level.level is not None else replace(level, found=None)
+    )
 
 
-def _level(image: Image, requested_dn: float | None, instrument_dn: float | None) -> _Level:
+def _level(image: Image, requested_dn: float | None, instrument_dn: float | None) -> Saturation:
     """The lowest known level."""
     unit, header = parse_unit(image.unit), image.header
-    cards = {key: optional_number(header, key) for key in _LEVEL_CARDS}
-    levels = [_Level(level, key) for key, level in cards.items() if level is not None and level > 0]
+    levels = [
+        Saturation(level, key, None)
+        for key in _LEVEL_CARDS
+        if (level := optional_number(header, key) or 0.0) > 0
+    ]
     is_aia = (optional_text(header, "TELESCOP") or "").upper() == "SDO/AIA"
     in_dn = {
         INSTRUMENT: instrument_dn,
@@ -113,39 +109,34 @@ def _level(image: Image, requested_dn: float | None, instrument_dn: float | None
     if requested_dn is not None:
         scale = per_dn(unit, image.exposure_s, "because the saturation level is in DN")
         in_dn = {REQUEST: requested_dn}
-    for source, level in in_dn.items():
-        if level is None:
-            continue
-        if scale is not None and scale > 0:
-            levels.append(_Level(level / scale, source))
-        elif not levels:
+    for source, dn in in_dn.items():
+        if dn is not None and scale is not None and scale > 0:
+            levels.append(Saturation(dn / scale, source, None))
+        elif dn is not None and not levels:
             why = f"its unit is {unit.text}" if unit.kind == "other" else "the header gives no exposure time"
-            return _Level(
+            return Saturation(
                 None,
                 source,
-                f"the saturation level of {level:g} DN cannot be compared with the image, because {why}: {_SETTING}",
+                f"the saturation level of {dn:g} DN cannot be compared with the image, because {why}: {_SETTING}",
             )
-    found = min(levels, key=lambda level: level.value or 0.0, default=_Level(None, None))
+    found = min(levels, key=lambda one: one.level or 0.0, default=Saturation(None, None, None))
     return (
-        _rate_or_counts(image, found, scale)
-        if unit.kind == "rate" and found.source in _LEVEL_CARDS
-        else found
+        _rate_or_counts(image, found, scale) if unit.kind == "rate" and found.found in _LEVEL_CARDS else found
     )
 
 
-def _rate_or_counts(image: Image, level: _Level, scale: float | None) -> _Level:
+def _rate_or_counts(image: Image, level: Saturation, scale: float | None) -> Saturation:
     """The level of a card of an image in DN/s. It may also be in DN of the exposure, if only then pixels are saturated."""
-    if level.value is None or scale is None or np.any(image.pixels >= level.value):
+    if level.level is None or scale is None or np.any(image.pixels >= level.level):
         return level
-    counted, there = _stated(image), np.count_nonzero(image.pixels >= level.value / scale)
+    counted, there = _stated(image), np.count_nonzero(image.pixels >= level.level / scale)
     if scale <= 1 or there == 0 or counted == 0:
         return level
     if counted is not None and there <= counted:
-        return _Level(level.value / scale, level.source)
-    return _Level(
-        level.value,
-        level.source,
-        f"no pixel reaches the saturation level {level.source} = {level.value:g}, but {there} pixels do if it is in DN of one exposure: "
+        return replace(level, level=level.level / scale)
+    return replace(
+        level,
+        warning=f"no pixel reaches the saturation level {level.found} = {level.level:g}, but {there} pixels do if it is in DN of one exposure: "
         f"if it is, {_SETTING}",
     )
 
@@ -156,30 +147,30 @@ def _stated(image: Image) -> int | None:
     return None if counted is None else int(counted)
 
 
-def _counted(image: Image, level: _Level) -> _Level:
+def _counted(image: Image, level: Saturation) -> Saturation:
     """The level after the comparison with the count of the header."""
     counted = _stated(image)
-    if counted is None or level.source is None:
+    if counted is None or level.found is None:
         return level
     card = next(key for key in _COUNTS if optional_number(image.header, key) is not None)
-    if level.value is None:
+    if level.level is None:
         if not 0 < counted <= LARGEST_COUNTED * image.pixels.size:
             return level if counted else replace(level, warning=None)
-        return _Level(
+        return Saturation(
             _brightest(image, counted),
             card,
             f"{level.warning}. {card} counts {counted} saturated pixels, so the {counted} brightest are masked",
         )
-    above = int(np.count_nonzero(image.pixels[image.finite] > level.value))
+    above = int(np.count_nonzero(image.pixels[image.finite] > level.level))
     if above > COUNT_ERROR * counted:
-        return _Level(
+        return Saturation(
             _brightest(image, counted) if counted else None,
             card,
-            f"{above} pixels are above the saturation level {level.value:g}, but {card} counts {counted} saturated pixels: the values "
+            f"{above} pixels are above the saturation level {level.level:g}, but {card} counts {counted} saturated pixels: the values "
             f"were changed after they were counted; {f'the {counted} brightest are' if counted else 'none is'} masked: if this is wrong, "
             f"{_SETTING}",
         )
-    if level.source == "NSATPIX" and counted and not np.any(image.pixels >= level.value):
+    if level.found == "NSATPIX" and counted and not np.any(image.pixels >= level.level):
         return replace(
             level,
             warning=f"NSATPIX counts {counted} saturated pixels, but no pixel is at {AIA_LEVEL_DN:g} DN or above: the image "
@@ -204,8 +195,7 @@ def largest_value(pixels: Pixels, valid: NDArray[np.bool_]) -> tuple[float, int,
     brightest = _brightest_below(pixels, valid, top)
     if brightest.size == 0:
         return top, count, 1.0
-    mean_per_value = brightest.size / np.unique(brightest).size
-    return top, count, _at_least(count, mean_per_value)
+    return top, count, _at_least(count, brightest.size / np.unique(brightest).size)
 
 
 def _at_least(count: int, mean: float) -> float:
@@ -223,8 +213,7 @@ def _brightest_below(pixels: Pixels, valid: NDArray[np.bool_], top: float) -> Pi
     for first in range(0, pixels.shape[0], _BLOCK_ROWS):
         rows = slice(first, first + _BLOCK_ROWS)
         block = pixels[rows]
-        chosen = valid[rows] & (block < top) & (block >= least)
-        brightest = np.concatenate([brightest, block[chosen]])
+        brightest = np.concatenate([brightest, block[valid[rows] & (block < top) & (block >= least)]])
         if brightest.size > COMPARED:
             brightest = np.partition(brightest, brightest.size - COMPARED)[-COMPARED:]
             least = float(brightest.min())  # few pixels of the later blocks are above it

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 from psfcore.errors import DataError
 from psfcore.fits.blocks import BLOCK_BYTES, FitsLimits
+from psfcore.fits.cards import without_cards
 from psfcore.fits.header import PRODUCT, HeaderSummary, read_first_image
 from psfcore.limited import run_limited
 
@@ -122,8 +123,7 @@ def cutout(path: Path, size: int, limits: FitsLimits) -> Cutout:
     ny, nx = summary.shape
     if not 1 <= size <= min(ny, nx):
         raise DataError("cutout-too-large", f"expected a size of 1 to {min(ny, nx)} px; got {size}")
-    plain = summary.hdu == 0 and summary.codec is None and not summary.gzipped
-    if not plain or summary.bitpix not in _FLOATS:
+    if summary.hdu != 0 or summary.codec is not None or summary.gzipped or summary.bitpix not in _FLOATS:
         raise DataError(
             "cutout-not-plain",
             "expected a PSF stored as uncompressed floats in the first HDU; this PSF is compressed, stored as integers, or "
@@ -136,23 +136,20 @@ def cutout(path: Path, size: int, limits: FitsLimits) -> Cutout:
         )
     part = Cutout(b"", path, image.start, (ny, nx), summary.bitpix, size)
     total = math.fsum(chain.from_iterable(_weights(piece, summary.bitpix) for piece in part.rows()))
-    text = _cut_header(image.header, (ny, nx), size, total).tostring().encode("ascii")
-    return replace(part, header=text)
+    header = _cut_header(image.header, (ny, nx), size, total)
+    return replace(part, header=header.tostring().encode("ascii"))
 
 
 def _weights(piece: bytes, bitpix: int) -> array[float]:
     """The pixels of a piece as numbers."""
-    weights: array[float] = array(_FLOATS[bitpix])
-    weights.frombytes(piece)
+    weights: array[float] = array(_FLOATS[bitpix], piece)
     if sys.byteorder == "little":
         weights.byteswap()
     return weights
 
 
 def _cut_header(header: Header, shape: tuple[int, int], size: int, total: float) -> Header:
-    cut = header.copy()
-    for key in _DROPPED:
-        cut.remove(key, ignore_missing=True, remove_all=True)
+    cut = without_cards(header, _DROPPED)
     for axis, whole in ((1, shape[1]), (2, shape[0])):
         cut[f"NAXIS{axis}"] = size
         if f"CRPIX{axis}" in cut:

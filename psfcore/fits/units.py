@@ -14,7 +14,7 @@ from functools import cache
 from typing import Any, Literal
 
 from psfcore.errors import DataError
-from psfcore.fits.cards import LONGEST_TEXT, Cards, optional_text
+from psfcore.fits.cards import LONGEST_TEXT, Cards, history_of, optional_text
 from psfcore.image import Image
 
 Kind = Literal["count", "rate", "other", "unknown"]
@@ -136,11 +136,7 @@ def _parsed(text: str) -> Any:
 def _unit_of_xrt(header: Cards) -> str | None:
     if (optional_text(header, "INSTRUME") or "").upper() != "XRT":
         return None
-    try:
-        history = str(header["HISTORY"])
-    except KeyError:
-        history = ""
-    return "DN/s" if "XRT_RENORMALIZE" in history.upper() else "DN"
+    return "DN/s" if "XRT_RENORMALIZE" in history_of(header).upper() else "DN"
 
 
 def unit_label(image: Image) -> str:
@@ -149,9 +145,8 @@ def unit_label(image: Image) -> str:
     The unit is the card BUNIT, or else the card PIXLUNIT, which AIA uses. Without these cards it is "unit unknown".
     """
     unit = _unit(image)
-    if not _COUNTS.fullmatch(unit):
-        return unit
-    return f"{unit}, exposure unknown" if image.exposure_s is None else f"{unit} in {image.exposure_s:.4g} s"
+    exposure = ", exposure unknown" if image.exposure_s is None else f" in {image.exposure_s:.4g} s"
+    return f"{unit}{exposure}" if _COUNTS.fullmatch(unit) else unit
 
 
 def rate_label(image: Image) -> str:
@@ -164,5 +159,5 @@ def rate_label(image: Image) -> str:
 
 def _unit(image: Image) -> str:
     """The unit without spaces at its ends; the letter $ would start a formula in a label, so it is removed."""
-    found = image.unit or optional_text(image.header, "PIXLUNIT") or ""
-    return found.replace("$", "").strip()[:_LONGEST] or _UNKNOWN
+    text = (image.unit or optional_text(image.header, "PIXLUNIT") or "").replace("$", "")
+    return text.strip()[:_LONGEST] or _UNKNOWN

@@ -96,20 +96,16 @@ class Planes:
         with turn:
             plane = self.kept(key)
             if plane is None:
-                with self._temporary() as path:
-                    with path.open("wb") as target:
-                        decoded = decode(target)
-                    plane = Plane(path, decoded)
-                self._keep(key, plane)
+                with self._temporary() as path, path.open("wb") as target:
+                    plane = Plane(path, decode(target))
+                with self._lock:
+                    self._kept[key] = plane
+                    while (
+                        len(self._kept) > MOST_PLANES
+                        or sum(one.length for one in self._kept.values()) > MOST_BYTES
+                    ):
+                        self._kept.popitem(last=False)
             return plane
-
-    def _keep(self, key: Key, plane: Plane) -> None:
-        with self._lock:
-            self._kept[key] = plane
-            while (
-                len(self._kept) > MOST_PLANES or sum(one.length for one in self._kept.values()) > MOST_BYTES
-            ):
-                self._kept.popitem(last=False)
 
 
 def decode_plane(path: str | Path, name: str, limits: FitsLimits, target: BinaryIO) -> Decoded:
@@ -139,9 +135,9 @@ def _number_of_plane(path: str | Path, name: str, limits: FitsLimits) -> int:
     """The HDU of a plane of a product. Raises DataError "no-such-plane"."""
     planes = {hdu.name: hdu.number for hdu in all_hdus(path, limits)[1:] if is_plane(hdu)}
     if name not in planes:
-        there = ", ".join([IMAGE, *map(str.lower, planes)])
         advice = ": submit the deconvolution with error_draws" if name == "ERROR" else ""
         raise DataError(
-            "no-such-plane", f"expected a plane of this file ({there}); got {name.lower()}{advice}"
+            "no-such-plane",
+            f"expected a plane of this file ({', '.join([IMAGE, *map(str.lower, planes)])}); got {name.lower()}{advice}",
         )
     return planes[name]

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits, first_image
-from psfcore.fits.cards import number_of
+from psfcore.fits.cards import number_of, without_cards
 from psfcore.fits.hdus import readable_pixels
 from psfcore.fits.header import all_hdus, shape_of
 from psfcore.limited import run_limited
@@ -62,8 +62,9 @@ class Region:
     def box(cls, frame: Frame, x: float, y: float, width: float, height: float) -> Region:
         """The box with its centre at (x, y)."""
         right, up = width / 2, height / 2
-        corners = [(x - right, y - up), (x + right, y - up), (x + right, y + up), (x - right, y + up)]
-        return cls.polygon(frame, corners)
+        return cls.polygon(
+            frame, [(x - right, y - up), (x + right, y - up), (x + right, y + up), (x - right, y + up)]
+        )
 
     @classmethod
     def polygon(cls, frame: Frame, corners: Sequence[tuple[float, float]]) -> Region:
@@ -80,17 +81,22 @@ def write_cutout(path: str | Path, region: Region, limits: FitsLimits, target: B
     "no-helioprojective" if the header gives no helioprojective coordinates, and "unreadable-pixels".
     """
     image = first_image(iter(all_hdus(path, limits)), limits)
-    pixels = math.prod(shape_of(image.header))
-    run_limited(cut_out, path, target, pixels=pixels, frame=region.frame, edge=region.edge.tolist())
+    run_limited(
+        cut_out,
+        path,
+        target,
+        pixels=math.prod(shape_of(image.header)),
+        frame=region.frame,
+        edge=region.edge.tolist(),
+    )
 
 
 def cut_out(target: BinaryIO, *, path: str, frame: Frame, edge: list[list[float]]) -> dict[str, Any]:
     """Write the cut-out of a product to ``target``. Call it in a limited process (`psfcore.limited`)."""
-    region = Region(frame, np.asarray(edge))
     with readable_pixels(path, "the region"), fits.open(path, memmap=False) as hdus:
         image = hdus[0]
         ny, nx = image.shape
-        columns, rows = _window(region, image.header, (ny, nx))
+        columns, rows = _window(Region(frame, np.asarray(edge)), image.header, (ny, nx))
         planes = [hdu for hdu in hdus[1:] if isinstance(hdu, fits.ImageHDU) and hdu.shape == (ny, nx)]
         parts = [_cut(hdu, columns, rows) for hdu in (image, *planes)]
         parts[0].header.add_history(
@@ -125,15 +131,14 @@ def _pixels_of(points: Points, header: fits.Header) -> Points:
     from astropy.wcs import WCS  # loads slowly, and a deconvolution of a box only moves the reference pixels
 
     # The cards of a file go into a C library, so it gets those of the two axes of the image alone.
-    own = fits.Header([card for card in header.cards if _OF_TWO_AXES.fullmatch(card.keyword)])
-    wcs = WCS(own, fix=False)
+    own = [card for card in header.cards if _OF_TWO_AXES.fullmatch(card.keyword)]
+    wcs = WCS(fits.Header(own), fix=False)
     axes = [str(name)[:4] for name in wcs.wcs.ctype]
     if axes != ["HPLN", "HPLT"]:
-        got = ", ".join(filter(None, axes)) or "none"
         raise DataError(
             "no-helioprojective",
-            f"expected an image with helioprojective coordinates (CTYPE1 HPLN-..., CTYPE2 HPLT-...); got {got}: give the "
-            "region in pixels, FRAME=pixel",
+            "expected an image with helioprojective coordinates (CTYPE1 HPLN-..., CTYPE2 HPLT-...); got "
+            f"{', '.join(filter(None, axes)) or 'none'}: give the region in pixels, FRAME=pixel",
         )
     pixels: Points = wcs.wcs_world2pix(points / _ARCSEC_PER_DEG, 0)
     if not np.isfinite(pixels).all():
@@ -146,9 +151,7 @@ def _pixels_of(points: Points, header: fits.Header) -> Points:
 
 def moved_header(whole: fits.Header, columns: slice, rows: slice) -> fits.Header:
     """The header of these columns and rows of an image. Their pixels keep their places on the sky."""
-    header = whole.copy()
-    for key in _DROPPED:
-        header.remove(key, ignore_missing=True, remove_all=True)
+    header = without_cards(whole, _DROPPED)
     for card in list(header.cards):
         moved = _MOVED.fullmatch(card.keyword)
         if moved is not None and (at := number_of(card.value)) is not None:
@@ -157,7 +160,5 @@ def moved_header(whole: fits.Header, columns: slice, rows: slice) -> fits.Header
 
 
 def _cut(hdu: Any, columns: slice, rows: slice) -> Any:
-    header = moved_header(hdu.header, columns, rows)
-    pixels = np.asarray(hdu.section[rows, columns])
     make = fits.PrimaryHDU if isinstance(hdu, fits.PrimaryHDU) else fits.ImageHDU
-    return make(pixels, header)
+    return make(np.asarray(hdu.section[rows, columns]), moved_header(hdu.header, columns, rows))

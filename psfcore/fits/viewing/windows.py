@@ -58,8 +58,7 @@ def window_of(
     ny, nx = shape
     width = nx - x if width is None else width
     height = ny - y if height is None else height
-    inside = 0 <= x < x + width <= nx and 0 <= y < y + height <= ny
-    if not inside:
+    if not (0 <= x < x + width <= nx and 0 <= y < y + height <= ny):
         raise DataError(
             "window-outside",
             f"expected a window inside the plane of {nx} x {ny} px: x + width at most {nx}, y + height at most {ny}; got x {x}, "
@@ -87,11 +86,10 @@ def pixels(plane: Plane, window: Window, *, bits: bool) -> Iterator[bytes]:
 
 def _read(plane: Plane, window: Window, first: int, end: int, at_once: int) -> Iterator[NDArray[np.float32]]:
     """The rows ``first`` to ``end`` (excluded) of the window, at most ``at_once`` rows at a time."""
-    columns = slice(window.x, window.x + window.width)
     for row in range(first, end, at_once):
         count = min(at_once, end - row)
         stored = np.frombuffer(plane.rows(row, count), dtype="<f4").reshape(count, plane.shape[1])
-        yield stored[:, columns]
+        yield stored[:, window.x : window.x + window.width]
 
 
 def _mean(pieces: Iterator[NDArray[np.float32]], step: int) -> NDArray[np.float64]:

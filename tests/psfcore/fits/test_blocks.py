@@ -40,6 +40,13 @@ BAD = {
     "four axes": (cube(4, 4, 2, 2), "not-2d"),
     "60000 x 60000": (block(*image_cards(60000, 60000)), "too-many-pixels"),
     "huge axes": (block(*image_cards(2**40, 2**40)), "too-many-pixels"),
+    "20 axes": (
+        block(
+            "SIMPLE  =                    T", "BITPIX  =                   16", "NAXIS   =                   20",
+            *(f"NAXIS{axis:<3}= {2**63 - 1:>20}" for axis in range(1, 21)),
+        ),
+        "bad-card",
+    ),
     "axes beyond 64 bits": (block(*image_cards(10**30, 2)), "bad-card"),
     "no columns": (block(*image_cards(0, 16)), "zero-size"),
     "negative axis": (block(*image_cards(-32, 16)), "bad-card"),
