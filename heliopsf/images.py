@@ -200,7 +200,7 @@ def deconvolve(  # type: ignore[misc]  # the overloads need not repeat the optio
     given = None if psf is None else given_psf(psf, threads=options.threads, progress=begin(BUILDING, 1))
 
     def one(image: Any) -> Any:
-        box = None if region is None else box_of(region, image)
+        box = None if region is None else box_of(region, image, hdu)
         sigma = None if noise is not None else uncertainty_of(image)
         if sigma is not None and not error_draws:
             message = "the uncertainty of the image is not used: error_draws=8 uses it as the noise, and gives it back"
@@ -229,7 +229,7 @@ def deconvolve(  # type: ignore[misc]  # the overloads need not repeat the optio
             say=lambda code, message: warnings.warn(DataWarning(code, message), stacklevel=5),
         )
         result = Deconvolution(**vars(product) | {"psf": Psf.of(product.psf)})
-        return result if full else in_form_of(image if box is None else cut(image, box), result)
+        return result if full else in_form_of(image if box is None else cut(image, box, hdu), result)
 
     if not is_many(smap):
         with on_disk(smap) as image:

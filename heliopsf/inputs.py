@@ -130,9 +130,20 @@ def image_of(image: Any, *, saturation: Any, hdu: int | None = None) -> Image:
         real_pixels(data),
         parts.header,
         bits=stored_bits(data, parts.header),
-        planes={name: np.asarray(plane) for name, plane in parts.planes.items() if plane is not None},
+        planes={
+            name: _as_large(plane, data.shape) for name, plane in parts.planes.items() if plane is not None
+        },
         saturation_dn=level,
     )
+
+
+def _as_large(plane: Any, shape: tuple[int, ...]) -> NDArray[Any]:
+    """A mask or an uncertainty for every pixel. Raises ``DataError`` "mask-shape"."""
+    try:
+        return np.broadcast_to(plane, shape)
+    except ValueError as error:
+        message = f"expected a mask and an uncertainty of {shape}; got {np.shape(plane)}"
+        raise DataError("mask-shape", message) from error
 
 
 def uncertainty_of(image: Any) -> NDArray[np.float64] | None:
@@ -298,14 +309,14 @@ def _header(meta: Mapping[str, Any]) -> Header:
     return header
 
 
-def box_of(region: Any, image: Any) -> Box:
+def box_of(region: Any, image: Any, hdu: int | None = None) -> Box:
     """The pixels of a region of an image.
 
     region: a text "x0:x1,y0:y1"; two slices [y, x], such as ``np.s_[50:250, 100:400]``; or, for a Map, its bottom left
     and top right corner as ``Map.submap`` takes them: coordinates, or quantities in pixels.
     Raises ``DataError`` "bad-region", "region-outside" or "region-too-small".
     """
-    shape = shape_of(image)
+    shape = shape_of(image, hdu)
     if isinstance(region, str):
         return Box.parse(region).checked(shape)
     two = isinstance(region, tuple | list) and len(region) == 2
@@ -335,7 +346,7 @@ def box_of(region: Any, image: Any) -> Box:
     return Box(x0, x0 + nx, y0, y0 + ny).checked(shape)
 
 
-def cut(image: Any, box: Box) -> Any:
+def cut(image: Any, box: Box, hdu: int | None = None) -> Any:
     """The box of a Map, an NDData or an HDU, with its coordinates; other images unchanged."""
     if is_map(image):
         top_right = [box.x1 - 1, box.y1 - 1] * units.pix
@@ -350,7 +361,7 @@ def cut(image: Any, box: Box) -> Any:
             unit=image.unit,
         )
     if isinstance(image, fits.HDUList):
-        return fits.HDUList([cut(hdu_of(image), box)])
+        return fits.HDUList([cut(hdu_of(image, hdu), box)])
     if is_hdu(image):
         return type(image)(image.data[box.slices], moved_header(image.header, columns, rows))
     if is_pair(image):

@@ -23,6 +23,7 @@ import resource
 import selectors
 import signal
 import socket
+import stat
 import subprocess
 import sys
 import threading
@@ -37,10 +38,10 @@ from psfcore.errors import DataError, HeaderError
 from psfcore.wall import raise_wall, walls
 
 MIB = 2**20
-SECONDS = 60  # of processor time; a child may take four times as long if the machine is busy
-LONGEST_S, PATIENCE_S = 4.0 * SECONDS, 4.0 * SECONDS + 30  # of a child, and of the wait for its answer
+SECONDS = 60  # of processor time; a child may take ten times as long if the machine is busy
+LONGEST_S, PATIENCE_S = 10.0 * SECONDS, 10.0 * SECONDS + 30  # of a child, and of the wait for its answer
 TRIES = 3
-EXIT = -1  # a child ended itself
+EXIT, LATE = -1, -2  # a child ended itself; the server ended it, because it took too long
 # What ends a child because of its file; SIGXCPU is the limit of its processor time.
 _OF_FILE = (
     EXIT,
@@ -54,8 +55,8 @@ _OF_FILE = (
     signal.SIGXCPU,
 )
 _BYTES_A_PIXEL, _MORE_BYTES = 64, 128 * MIB  # of memory, in addition to the libraries
-# Modules with a function that lets their library do what it does once, before there is a wall.
-_PRELOADED = ("psfcore.fits.hdus",)
+# The first one lets its library do what it does once, before there is a wall.
+_PRELOADED = ("psfcore.fits.hdus", "psfcore.transit.members")
 _KEPT_VARIABLES = ("HOME", "PATH", "LANG", "TMPDIR", "OPENBLAS_CORETYPE", "OPENBLAS_L2_SIZE")
 _M_PERTURB = -6  # option of mallopt(3): new memory is filled with this byte
 FILLING = 0x55
@@ -67,12 +68,19 @@ _is_child = False
 
 
 def run_limited(
-    function: Callable[..., Answer], path: str | Path, target: BinaryIO, *, pixels: int, **arguments: Any
+    function: Callable[..., Answer],
+    path: str | Path,
+    target: BinaryIO,
+    *,
+    pixels: int,
+    seconds: int = SECONDS,
+    **arguments: Any,
 ) -> Answer:
     """Call ``function(target, path=path, **arguments)`` in a child process; returns its answer.
 
     function: a function of a module that reads the file ``path``. target: an open file, to which it may write. arguments,
-    answer: values that JSON can hold. pixels: the number of pixels of the file, which limits the memory of the child. Raises
+    answer: values that JSON can hold. pixels: the number of pixels of the file, which limits the memory of the child. seconds: the
+    limit of its processor time. Raises
     the DataError, HeaderError or OSError of the function; DataError "unreadable-pixels" if the child crashed, or needed more
     memory or processor time than its pixels explain; OSError if the child was ended from outside again and again, or gave no answer
     in PATIENCE_S.
@@ -83,6 +91,7 @@ def run_limited(
     request = {
         "function": f"{function.__module__}:{function.__qualname__}",
         "memory_bytes": _BYTES_A_PIXEL * pixels + path.stat().st_size + _MORE_BYTES,
+        "seconds": seconds,
         "filling": FILLING,
         "arguments": {"path": str(path)} | arguments,
     }
@@ -97,8 +106,14 @@ def run_limited(
                 f"expected readable pixels in {path.name}; reading {pixels} pixels crashed, or needed much more memory or time than "
                 "they explain: copy or make the file again",
             )
-        os.ftruncate(target.fileno(), start)
-        os.lseek(target.fileno(), start, os.SEEK_SET)
+        if reply.get("ended") == LATE:
+            raise OSError(
+                errno.ETIMEDOUT,
+                f"the process that read {path.name} gave no answer in {LONGEST_S:g} s: try again",
+            )
+        if stat.S_ISREG(os.fstat(target.fileno()).st_mode):
+            os.ftruncate(target.fileno(), start)
+            os.lseek(target.fileno(), start, os.SEEK_SET)
     raise OSError(
         errno.EAGAIN, f"the process that read {path.name} was ended from outside {TRIES} times: try again"
     )
@@ -222,8 +237,8 @@ def _stop() -> None:
 
 def _serve() -> None:
     """Fork a child for each pair of files that the owner of this process sends, until the owner has ended."""
-    for name in _PRELOADED:
-        importlib.import_module(name).prepare_library()
+    hdus, *_ = [importlib.import_module(name) for name in _PRELOADED]
+    hdus.prepare_library()
     gc.disable()
     gc.freeze()  # a search for garbage would copy the memory that a child shares with this process
     woken, wake = os.pipe()
@@ -258,15 +273,15 @@ def _serve() -> None:
 def _bury(children: dict[int, tuple[int, float]]) -> None:
     """Tell of each child how it has ended, which counts if it gave no answer; and kill those that are late."""
     for child, (connection, until) in list(children.items()):
-        if time.monotonic() > until:
+        late = time.monotonic() > until
+        if late:
             os.kill(child, signal.SIGKILL)  # also if it was stopped
         ended, status = os.waitpid(child, os.WNOHANG)
         if not ended:
             continue
+        how = LATE if late else os.WTERMSIG(status) if os.WIFSIGNALED(status) else EXIT
         with contextlib.suppress(OSError):  # the owner has the answer already
-            os.write(
-                connection, b'\n{"ended": %d}\n' % (os.WTERMSIG(status) if os.WIFSIGNALED(status) else EXIT)
-            )
+            os.write(connection, b'\n{"ended": %d}\n' % how)
         os.close(connection)
         del children[child]
 
@@ -274,6 +289,8 @@ def _bury(children: dict[int, tuple[int, float]]) -> None:
 def _work(connection: int, target: int) -> None:
     """Run one request and end this process."""
     signal.set_wakeup_fd(-1)
+    nothing = os.open(os.devnull, os.O_RDONLY)  # in the place of the socket to the owner
+    os.dup2(nothing, 0)
     low, high = sorted((connection, target))
     for first, end in ((3, low), (low + 1, high), (high + 1, resource.getrlimit(resource.RLIMIT_NOFILE)[0])):
         os.closerange(first, end)  # the connections of other children
@@ -290,9 +307,9 @@ def _reply(request: Answer, target: int) -> Answer:
     of_functions._is_child = True
     module, name = request["function"].split(":")
     function = getattr(importlib.import_module(module), name)
-    _limit(request["memory_bytes"])
     fill_new_memory(request["filling"])
     try:
+        _limit(request["memory_bytes"], request["seconds"])
         raise_wall([request["arguments"]["path"]])
         with os.fdopen(target, "wb") as file:
             return {"answer": function(file, **request["arguments"])}
@@ -307,10 +324,14 @@ def _reply(request: Answer, target: int) -> Answer:
         return {"fault": traceback.format_exc()}
 
 
-def _limit(memory_bytes: int) -> None:
+def _limit(memory_bytes: int, seconds: int) -> None:
     """Limit the memory and the time of this process."""
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
+    _, most = resource.getrlimit(resource.RLIMIT_CPU)
+    unlimited = most == resource.RLIM_INFINITY
+    soft = seconds if unlimited else min(seconds, most)
+    # The hard limit is above the soft one, because at the hard limit the signal does not tell what it is about.
+    resource.setrlimit(resource.RLIMIT_CPU, (soft, soft + 5 if unlimited else most))
     signal.alarm(round(PATIENCE_S))  # if the server has ended
     if sys.platform == "linux":
         # RLIMIT_DATA also counts what the libraries hold; other systems do not enforce it.

@@ -4,7 +4,7 @@ Two parts of Linux make the wall, and neither can be taken down again by the pro
 
 - Landlock (Linux 5.13 and later): of all files the process can open those that it may read, and the folders of the libraries' code.
   Files that are open already stay open.
-- seccomp: the process cannot make sockets, start programs, or reach other processes.
+- seccomp: the process cannot make sockets, start programs or processes, reach other processes, or change modes and times of files.
 
     raise_wall([path])
     walls()     # {"files": True, "calls": True}
@@ -31,27 +31,41 @@ _READ_FILE, _READ_FOLDER = 1 << 2, 1 << 3
 _KINDS = {1: 13, 2: 14, 3: 15, 4: 15}
 _LATEST_KINDS = 16
 _SET_NO_NEW_PRIVS, _SET_SECCOMP, _FILTER = 38, 22, 2
-_LOAD, _EQUAL, _AT_LEAST, _RETURN = 0x20, 0x15, 0x35, 0x06  # instructions of BPF
-_NUMBER_AT, _MACHINE_AT = 0, 4  # in struct seccomp_data
-_ALLOW, _REFUSE = 0x7FFF0000, 0x00050000 | errno.EPERM
+_LOAD, _EQUAL, _AT_LEAST, _ANY_BIT, _RETURN = 0x20, 0x15, 0x35, 0x45, 0x06  # instructions of BPF
+_NUMBER_AT, _MACHINE_AT, _ARGUMENT_AT = 0, 4, 16  # in struct seccomp_data
+_ALLOW, _REFUSE, _MISSING = 0x7FFF0000, 0x00050000 | errno.EPERM, 0x00050000 | errno.ENOSYS
 _OTHER_NUMBERS = 0x40000000  # system calls of the x32 interface
-# For each machine: its number in the audit interface, and the system calls that are refused.
+_A_THREAD = 0x10000  # flag of clone
+# For each machine: its number in the audit interface, and the system calls that are refused: sockets, programs, other processes,
+# changes of files that need not be opened, and memory of other processes.
 _MACHINES: dict[str, tuple[int, dict[str, int]]] = {
     "x86_64": (0xC000003E, {
-        "socket": 41, "connect": 42, "accept": 43, "bind": 49, "listen": 50, "socketpair": 53, "fork": 57,
-        "vfork": 58, "execve": 59, "kill": 62, "ptrace": 101, "mount": 165, "accept4": 288, "add_key": 248,
-        "request_key": 249, "keyctl": 250, "unshare": 272, "perf_event_open": 298, "open_by_handle_at": 304,
-        "setns": 308, "process_vm_readv": 310, "process_vm_writev": 311, "bpf": 321, "execveat": 322,
-        "userfaultfd": 323, "io_uring_setup": 425, "pidfd_open": 434, "pidfd_getfd": 438,
+        "shmget": 29, "shmat": 30, "socket": 41, "connect": 42, "accept": 43, "bind": 49, "listen": 50,
+        "socketpair": 53, "fork": 57, "vfork": 58, "execve": 59, "kill": 62, "msgget": 68, "truncate": 76,
+        "chmod": 90, "fchmod": 91, "chown": 92, "fchown": 93, "lchown": 94, "ptrace": 101, "rt_sigqueueinfo": 129,
+        "utime": 132, "setpriority": 141, "chroot": 161, "mount": 165, "setxattr": 188, "lsetxattr": 189,
+        "fsetxattr": 190, "tkill": 200, "sched_setaffinity": 203, "utimes": 235, "mq_open": 240, "add_key": 248,
+        "request_key": 249, "keyctl": 250, "fchownat": 260, "futimesat": 261, "fchmodat": 268, "unshare": 272,
+        "utimensat": 280, "accept4": 288, "rt_tgsigqueueinfo": 297, "perf_event_open": 298,
+        "open_by_handle_at": 304, "setns": 308, "process_vm_readv": 310, "process_vm_writev": 311, "bpf": 321,
+        "execveat": 322, "userfaultfd": 323, "pidfd_send_signal": 424, "io_uring_setup": 425, "pidfd_open": 434,
+        "pidfd_getfd": 438, "fchmodat2": 452,
     }),
     "aarch64": (0xC00000B7, {
-        "mount": 40, "unshare": 97, "ptrace": 117, "kill": 129, "socket": 198, "socketpair": 199, "bind": 200,
+        "setxattr": 5, "lsetxattr": 6, "fsetxattr": 7, "mount": 40, "truncate": 45, "chroot": 51, "fchmod": 52,
+        "fchmodat": 53, "fchownat": 54, "fchown": 55, "utimensat": 88, "unshare": 97, "ptrace": 117,
+        "sched_setaffinity": 122, "kill": 129, "tkill": 130, "rt_sigqueueinfo": 138, "setpriority": 140,
+        "mq_open": 180, "msgget": 186, "shmget": 194, "shmat": 196, "socket": 198, "socketpair": 199, "bind": 200,
         "listen": 201, "accept": 202, "connect": 203, "add_key": 217, "request_key": 218, "keyctl": 219,
-        "execve": 221, "perf_event_open": 241, "accept4": 242, "open_by_handle_at": 265, "setns": 268,
-        "process_vm_readv": 270, "process_vm_writev": 271, "bpf": 280, "execveat": 281, "userfaultfd": 282,
-        "io_uring_setup": 425, "pidfd_open": 434, "pidfd_getfd": 438,
+        "execve": 221, "rt_tgsigqueueinfo": 240, "perf_event_open": 241, "accept4": 242, "open_by_handle_at": 265,
+        "setns": 268, "process_vm_readv": 270, "process_vm_writev": 271, "bpf": 280, "execveat": 281,
+        "userfaultfd": 282, "pidfd_send_signal": 424, "io_uring_setup": 425, "pidfd_open": 434, "pidfd_getfd": 438,
+        "fchmodat2": 452,
     }),
 }  # fmt: skip
+# The numbers of clone, tgkill and prlimit64, which are allowed for threads and for the process itself, and of clone3.
+_OF_ITSELF = {"x86_64": (56, 234, 302), "aarch64": (220, 131, 261)}
+_CLONE3 = 435
 _up = {"files": False, "calls": False}
 
 
@@ -134,16 +148,32 @@ def _close_calls(libc: ctypes.CDLL) -> bool:
     if platform.machine() not in _MACHINES:
         return False
     machine, refused = _MACHINES[platform.machine()]
-    count = len(refused)
+    clone, tgkill, prlimit = _OF_ITSELF[platform.machine()]
     program = [
         (_LOAD, 0, 0, _MACHINE_AT),
-        (_EQUAL, 0, count + 3, machine),
+        (_EQUAL, 1, 0, machine),
+        (_RETURN, 0, 0, _REFUSE),
         (_LOAD, 0, 0, _NUMBER_AT),
-        (_AT_LEAST, count + 1, 0, _OTHER_NUMBERS),
-        *((_EQUAL, count - k, 0, number) for k, number in enumerate(refused.values())),
-        (_RETURN, 0, 0, _ALLOW),
+        (_AT_LEAST, 0, 1, _OTHER_NUMBERS),
         (_RETURN, 0, 0, _REFUSE),
     ]
+    for number in refused.values():
+        program += [(_EQUAL, 0, 1, number), (_RETURN, 0, 0, _REFUSE)]
+    # The C library then uses clone, whose flags a filter can see.
+    program += [(_EQUAL, 0, 1, _CLONE3), (_RETURN, 0, 0, _MISSING)]
+    for number, test, value in (
+        (clone, _ANY_BIT, _A_THREAD),
+        (tgkill, _EQUAL, os.getpid()),
+        (prlimit, _EQUAL, 0),
+    ):
+        program += [
+            (_EQUAL, 0, 4, number),
+            (_LOAD, 0, 0, _ARGUMENT_AT),
+            (test, 1, 0, value),
+            (_RETURN, 0, 0, _REFUSE),
+            (_RETURN, 0, 0, _ALLOW),
+        ]
+    program.append((_RETURN, 0, 0, _ALLOW))
     instructions = (_Instruction * len(program))(*(_Instruction(*one) for one in program))
     if libc.prctl(_SET_SECCOMP, _FILTER, ctypes.byref(_Program(len(program), instructions)), 0, 0) == 0:
         return True

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from decimal import Decimal
 from functools import cache
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -124,10 +123,16 @@ def number_of(value: object, *, text: bool = True) -> float | None:
     """A finite number, as a card, a table in memory or numpy holds it; None for anything else. text: also a number as text."""
     if isinstance(value, str):
         value = float(re.sub("[dD]", "e", value)) if text and _NUMBER.fullmatch(value.strip()) else None
-    value = plain_value(value)
-    if isinstance(value, bool) or not isinstance(value, (int, float, Decimal)):
+    if getattr(value, "mask", False) is not False:  # a masked cell of a table
         return None
-    return float(value) if -LARGEST_NUMBER < value < LARGEST_NUMBER else None
+    value = plain_value(value)
+    if value is None or isinstance(value, bool):
+        return None
+    try:
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError):
+        return None
+    return number if -LARGEST_NUMBER < number < LARGEST_NUMBER else None
 
 
 def optional_number(header: Cards, *keys: str) -> float | None:

@@ -89,13 +89,14 @@ def _with_planes(
 
     read(number): the pixels of one of the others. chosen: the number of the HDU, if the caller named it.
     """
-    planes, others = {}, []
+    planes: dict[str, NDArray[Any]] = {}
+    others: list[str] = []
     is_image = content_of(stored.header) == IMAGE
     for number, name, shape in stored.others:
         if name.upper() not in (*FLAGS, *ERRORS):
             others.append(f"{number} ({name})" if name else str(number))
         elif is_image and shape == stored.pixels.shape:
-            planes[name.upper()] = read(number)
+            planes.setdefault(name.upper(), read(number))  # further ones belong to further images
     image = observation_of(
         stored.pixels, stored.header, bits=stored.bits, planes=planes, saturation_dn=saturation_dn
     )

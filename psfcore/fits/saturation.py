@@ -8,7 +8,7 @@ an AIA image with NSATPIX has this level. A pixel of exactly 15000 DN counts as 
 NSATPIX and DATASAT count the saturated pixels of the exposure. A cut-out has fewer, but no image has more pixels above its level.
 If it has, its values were changed after they were counted (a correction of the degradation, sums of pixels), and the level does not
 belong to them: then as many pixels are masked as the header counts, the brightest ones. The same count decides if a level in DN
-cannot be converted to the unit of the image, and whether a level of the header of a rate is a rate or in DN of the exposure.
+cannot be converted to the unit of the image and the brightest pixels stand apart from the others, and whether a level of the header of a rate is a rate or in DN of the exposure.
 
 Saturation can also be found without a known level: in a saturated image many pixels have exactly the largest value,
 because the converter or the software that wrote the image cannot write a larger one. In an image that is not saturated,
@@ -74,13 +74,15 @@ def with_saturation(
         top, count, chance = largest_value(image.pixels, mask == 0)
         confirmed = level.found in (*_LEVEL_CARDS, *_COUNTS) and bool(np.any(mask & MaskBit.SATURATED.value))
         if chance < MASKED_BELOW and not confirmed:
-            masked = (
-                f"{count} pixels have the value {top:g}, the largest below the saturation level {level.level:g} "
-                f"({level.found}); they are masked as saturated: if they are not, {_SETTING}"
-                if level.level is not None
-                else level.warning
+            below = (
+                "" if level.level is None else f" below the saturation level {level.level:g} ({level.found})"
             )
-            level, mask = Saturation(top, PIXELS, masked), _masked(image, top)
+            told = (
+                f"{count} pixels have the value {top:g}, the largest{below}; they are masked as saturated: if they are not, {_SETTING}"
+                if below or level.warning
+                else None
+            )
+            level, mask = Saturation(top, PIXELS, told), _masked(image, top)
         elif chance < DOUBTED_BELOW and not level.warning:
             level = replace(
                 level,
@@ -144,7 +146,7 @@ def _rate_or_counts(image: Image, level: Saturation, scale: float | None) -> Sat
 def _stated(image: Image) -> int | None:
     """The number of saturated pixels that the header counts."""
     counted = optional_number(image.header, *_COUNTS)
-    return None if counted is None else int(counted)
+    return None if counted is None or counted < 0 else int(counted)
 
 
 def _counted(image: Image, level: Saturation) -> Saturation:
@@ -153,21 +155,27 @@ def _counted(image: Image, level: Saturation) -> Saturation:
     if counted is None or level.found is None:
         return level
     card = next(key for key in _COUNTS if optional_number(image.header, key) is not None)
+    values = image.pixels[image.finite]
     if level.level is None:
-        if not 0 < counted <= LARGEST_COUNTED * image.pixels.size:
+        if not 0 < counted <= LARGEST_COUNTED * values.size:
             return level if counted else replace(level, warning=None)
+        next_one, brightest = np.partition(values, (-counted - 1, -counted))[[-counted - 1, -counted]]
+        if (
+            brightest - next_one <= values.max() - brightest
+        ):  # they do not stand apart: the count may be of a larger image
+            return level
         return Saturation(
-            _brightest(image, counted),
+            float(brightest),
             card,
             f"{level.warning}. {card} counts {counted} saturated pixels, so the {counted} brightest are masked",
         )
-    above = int(np.count_nonzero(image.pixels[image.finite] > level.level))
+    above = int(np.count_nonzero(values > level.level))
     if above > COUNT_ERROR * counted:
         return Saturation(
-            _brightest(image, counted) if counted else None,
+            float(np.partition(values, -counted)[-counted]) if counted else None,
             card,
             f"{above} pixels are above the saturation level {level.level:g}, but {card} counts {counted} saturated pixels: the values "
-            f"were changed after they were counted; {f'the {counted} brightest are' if counted else 'none is'} masked: if this is wrong, "
+            f"were changed after they were counted; {f'about {counted} of the brightest are' if counted else 'none of them is'} masked: if this is wrong, "
             f"{_SETTING}",
         )
     if level.found == "NSATPIX" and counted and not np.any(image.pixels >= level.level):
@@ -177,12 +185,6 @@ def _counted(image: Image, level: Saturation) -> Saturation:
             f"was cut or its values were changed; saturated pixels that are left are not masked: {_SETTING}",
         )
     return level
-
-
-def _brightest(image: Image, count: int) -> float:
-    """The smallest of the `count` largest values."""
-    values = image.pixels[image.finite]
-    return float(np.partition(values, values.size - count)[values.size - count])
 
 
 def largest_value(pixels: Pixels, valid: NDArray[np.bool_]) -> tuple[float, int, float]:

@@ -36,6 +36,7 @@ SIGNED_BITS, HALF_RANGE = 16, 2.0**14
 BLOCK_PX, BESIDE_PX = 3, 6  # smallest block of zeros, and how far the pixels beside a block reach
 ZEROS_BESIDE = 0.01  # largest share of zeros beside a lost block
 DARKEST_BESIDE = 0.05  # the darkest pixels beside a lost block, in units of the median there
+MOSTLY = 0.5  # share of the row beside rows that were not received
 LARGEST_FLAGGED = 0.5  # share of pixels; a plane that declares more as bad does not mean bad pixels
 FLAGS, ERRORS = ("MASK", "DQF", "DQ", "QUALITY"), ("UNCERT", "UNCERTAINTY", "ERR", "ERROR", "VARIANCE")
 
@@ -74,6 +75,7 @@ def unusable_pixels(
         if where is not None:
             mask[where] |= int(MaskBit.NONFINITE)
             warnings[code] = f"{np.count_nonzero(where)} pixels {words}: they are not used"
+    told = []
     for name, plane in planes.items():
         bad = (plane != 0) if name in FLAGS else ~np.isfinite(plane)
         count = int(np.count_nonzero(bad))
@@ -81,12 +83,15 @@ def unusable_pixels(
         if used:
             mask[bad] |= int(MaskBit.NONFINITE)
         if count and name != "MASK":
-            warnings["quality-plane"] = f"the plane {name} of the file declares {count} bad pixels: " + (
-                "they are not used"
-                if used
-                else "it is not used, because these are more than half of the image"
+            told.append(
+                f"the plane {name} of the file declares {count} bad pixels: "
+                + (
+                    "they are not used"
+                    if used
+                    else "it is not used, because these are more than half of the image"
+                )
             )
-    return mask, warnings
+    return mask, warnings | ({"quality-plane": "; ".join(told)} if told else {})
 
 
 def _lost(pixels: Pixels, header: Cards, bits: int | None) -> Where | None:
@@ -119,11 +124,12 @@ def _wrapped(pixels: Pixels, valid: Where, header: Cards, bits: int | None) -> W
         or pixels.max(where=valid, initial=0) < HALF_RANGE
     ):
         return None
+    middle = float(np.median(pixels[valid & ~negative]))
+    if pixels.min(where=valid, initial=0) > -FAR * middle:  # no gap can be that wide
+        return None
     values = np.unique(np.append(pixels[negative], pixels.min(where=valid & ~negative, initial=np.inf)))
-    last = int(np.argmax(np.diff(values)))
-    below, above = values[last], values[last + 1]
-    far = above - below > FAR * (np.median(pixels[valid & (pixels >= above)]) - above)  # Eq. (1)
-    return negative & (pixels <= below) if far else None
+    far = np.flatnonzero(np.diff(values) > FAR * (middle - values[1:]))  # Eq. (1)
+    return negative & (pixels <= values[far[-1]]) if far.size else None
 
 
 def _blocks_of_zeros(pixels: Pixels) -> Where | None:
@@ -131,14 +137,37 @@ def _blocks_of_zeros(pixels: Pixels) -> Where | None:
     zero = pixels == 0
     if np.count_nonzero(zero) < BLOCK_PX**2:
         return None
+    cut = _rows_of_zeros(pixels, zero)
+    if cut is not None:
+        return cut
     from scipy import ndimage
 
     blocks = ndimage.binary_opening(zero, np.ones((BLOCK_PX, BLOCK_PX), np.bool_))
     if not blocks.any():
         return None
-    near = ndimage.binary_dilation(blocks, np.ones((3, 3), np.bool_), iterations=BESIDE_PX)
-    beside = pixels[near & ~blocks & np.isfinite(pixels)]
+    box = tuple(
+        slice(max(int(at.min()) - BESIDE_PX, 0), int(at.max()) + BESIDE_PX + 1)
+        for at in (np.flatnonzero(blocks.any(axis=1 - axis)) for axis in (0, 1))
+    )
+    near = ndimage.binary_dilation(blocks[box], np.ones((2 * BESIDE_PX + 1, 1), np.bool_))
+    near = ndimage.binary_dilation(near, np.ones((1, 2 * BESIDE_PX + 1), np.bool_))
+    beside = pixels[box][near & ~blocks[box] & np.isfinite(pixels[box])]
     if beside.size < BLOCK_PX * BESIDE_PX or np.count_nonzero(beside == 0) > ZEROS_BESIDE * beside.size:
         return None
     dark, middle = np.percentile(beside, (5, 50))
     return blocks if dark > DARKEST_BESIDE * middle > 0 else None
+
+
+def _rows_of_zeros(pixels: Pixels, zero: Where) -> Where | None:
+    """The rows of nothing but 0 at the bottom and the top, if the rows beside them are mostly not 0; None if there are none."""
+    some, found = np.flatnonzero(~zero.all(axis=1)), np.zeros(pixels.shape, np.bool_)
+    if not some.size:
+        return None
+    first, last = int(some[0]), int(some[-1])
+    for count, beside, rows in (
+        (first, first, slice(first)),
+        (len(zero) - 1 - last, last, slice(last + 1, None)),
+    ):
+        if count >= BLOCK_PX and np.count_nonzero(zero[beside]) < MOSTLY * zero.shape[1]:
+            found[rows] = True
+    return found if found.any() else None

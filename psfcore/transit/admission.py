@@ -1,21 +1,20 @@
 """The rules for accepting the members of an archive: their names, their number, their sizes.
 
-The rules are the same for a .zip and a .tar. This module imports no numerical library, so that the web process can apply
-the rules.
+The rules are the same for a .zip and a .tar. This module imports no other library: a process that reads an archive is short.
 """
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from psfcore.errors import DataError
-from psfcore.transit.manifest import MANIFEST_NAME, is_plain_name
 
+MANIFEST_NAME = "transit.json"
+MAX_MANIFEST_BYTES = 4 * 2**20
 RATIO_FLOOR_BYTES = 64 * 2**20  # up to this number of unpacked bytes, max_ratio is not checked
 _HIDDEN = ("__MACOSX", "PaxHeader", "PaxHeaders", "Thumbs.db", "desktop.ini")
-
-
+_DRIVE = re.compile(r"[A-Za-z]:")
 _DEEPEST = 3  # parts of the longest name: the folder of the transit, a folder beside its files, a file
 _WHERE = (
     "expected all files at the top level or in one folder, and no folders deeper than one level below that"
@@ -36,9 +35,10 @@ class ArchiveLimits:
     max_ratio: float = 200.0
     max_member_bytes: int = 2**30
 
-    def budget_bytes(self, archive_bytes: int) -> int:
-        """The most bytes that an archive of this size may unpack to."""
-        return min(self.max_bytes, max(RATIO_FLOOR_BYTES, int(self.max_ratio * archive_bytes)))
+    def of_archive(self, size_bytes: int) -> ArchiveLimits:
+        """The limits of an archive of this size, whose max_bytes include the ratio."""
+        by_ratio = max(RATIO_FLOOR_BYTES, int(self.max_ratio * size_bytes))
+        return replace(self, max_bytes=min(self.max_bytes, by_ratio))
 
 
 @dataclass(frozen=True)
@@ -49,38 +49,48 @@ class Admitted:
     name: str
 
 
+def is_plain_name(name: str) -> bool:
+    """True for the name of a file inside a folder: no path, no "..", no drive letter, only printable characters."""
+    return (
+        0 < len(name.encode("utf-8", "replace")) <= 255
+        and name.isprintable()
+        and not set("/\\") & set(name)
+        and name not in (".", "..")
+        and name == name.strip()
+        and _DRIVE.match(name) is None
+    )
+
+
 class Gate:
-    """Checks every member of one archive: its name, its number, its size, and the bytes unpacked so far.
+    """Checks every member of one archive: its name, its number and its size.
 
     The files of a transit are at the top level or in one folder. Beside them there may be other folders, one level
     deep. The files in these folders are ignored, but they are checked and counted like all other files.
     """
 
-    def __init__(self, limits: ArchiveLimits, archive_bytes: int) -> None:
+    def __init__(self, limits: ArchiveLimits) -> None:
         self.limits = limits
-        self._budget = limits.budget_bytes(archive_bytes)
-        self._declared = self._unpacked = self._members = 0
+        self._members = self._declared_bytes = 0
+        self._is_at_top = False  # there is a file outside all folders
         self._files: dict[Admitted, str] = {}  # accepted files and their names in the archive
         self._folders: list[str] = []  # names of folders that have entries of their own
 
-    def count_members(self, count: int = 1) -> None:
-        """Add members of any kind to the count. Raises DataError "archive-too-large"."""
-        self._members += count
-        self.check_members(self._members)
-
-    def check_members(self, count: int) -> None:
-        """Raise DataError "archive-too-large" if an archive must not have this number of members."""
-        if count > self.limits.max_files:
+    def count(self, size: int) -> None:
+        """Count a member of any kind and its declared bytes. Raises DataError "archive-too-large"."""
+        self._members += 1
+        if self._members > self.limits.max_files:
             message = (
                 f"expected at most {self.limits.max_files} members; got more: pack only {MANIFEST_NAME} and the files "
                 "that it names"
             )
             raise DataError("archive-too-large", message)
-
-    def count_unpacked(self, count: int) -> None:
-        """Add unpacked bytes to the count. Raises DataError "archive-too-large"."""
-        self._unpacked += count
-        self._check(self._unpacked)
+        self._declared_bytes += size
+        if self._declared_bytes > self.limits.max_bytes:
+            message = (
+                f"expected an archive that unpacks to at most {self.limits.max_bytes} bytes; got more: pack fewer or smaller "
+                "images"
+            )
+            raise DataError("archive-too-large", message)
 
     def admit(self, raw_name: str, size: int) -> Admitted | None:
         """Check a file; return its folder and its plain name, or None if the file is hidden and must be skipped.
@@ -102,13 +112,16 @@ class Gate:
         if file.name == MANIFEST_NAME and any(other.name == MANIFEST_NAME for other in self._files):
             raise not_plain(raw_name, f"expected {MANIFEST_NAME} only once")
         self._files[file] = raw_name
+        self._is_at_top = self._is_at_top or file.folder == ""
         if size > self.limits.max_member_bytes:
             most = self.limits.max_member_bytes
             message = f"{shown(raw_name)}: expected a file of at most {most} bytes; got {size} bytes"
             raise DataError("archive-too-large", message)
-        self._declared += size
-        self._check(self._declared)
         return file
+
+    def is_beside(self, file: Admitted) -> bool:
+        """True if it is known already that the folder of a file is not the folder of the transit."""
+        return "/" in file.folder or (file.folder != "" and self._is_at_top)
 
     def check_folder(self, raw_name: str) -> None:
         """Check the entry of a folder; the folder is not created. Raises DataError "archive-climbs", "archive-not-plain"."""
@@ -140,11 +153,6 @@ class Gate:
             raise not_plain(self._files[described[0]], message)
         return main
 
-    def _check(self, count: int) -> None:
-        if count > self._budget:
-            message = f"expected an archive that unpacks to at most {self._budget} bytes; got more: pack fewer or smaller images"
-            raise DataError("archive-too-large", message)
-
 
 def not_plain(raw_name: str, message: str) -> DataError:
     """The error for a member that is not a plain file with a plain name."""
@@ -165,7 +173,7 @@ def _parts(raw_name: str) -> list[str]:
     """The parts of a member's name: its folders and its file name. Raises DataError "archive-climbs"."""
     parts = [part for part in raw_name.split("/") if part not in ("", ".")]
     climbs = raw_name.startswith("/") or "\\" in raw_name or ".." in parts
-    if climbs or any(re.match(r"[A-Za-z]:", part) for part in parts):
+    if climbs or any(_DRIVE.match(part) for part in parts):
         message = f"expected names inside the folder of the archive; got {shown(raw_name)}: pack the files without their paths"
         raise DataError("archive-climbs", message)
     return parts

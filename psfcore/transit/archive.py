@@ -1,8 +1,8 @@
 """A transit in one archive file (.zip, .tar or .tar.gz), or in a folder: list, unpack, pack and identify it.
 
 The first bytes of the file identify the kind of archive. The members must be plain files with plain names, at the top
-level or in one folder. ``members`` reads them, ``admission`` decides which of them are accepted. If an archive is
-refused, none of its files is left on disk.
+level or in one folder. A limited process reads them (`members`), and `admission` decides which of them are accepted. This
+process handles the names and plain bytes that come back. If an archive is refused, none of its files is left on disk.
 
 This module imports no numerical library, so that the web process can list an upload.
 """
@@ -12,34 +12,32 @@ from __future__ import annotations
 import hashlib
 import io
 import re
-import shutil
 import tarfile
 import zlib
-from collections.abc import Mapping
-from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import IO, cast
+from tempfile import TemporaryFile
+from typing import IO, BinaryIO, cast
 
 from psfcore.errors import DataError, together
-from psfcore.transit.admission import ArchiveLimits
-from psfcore.transit.manifest import (
-    MANIFEST_NAME,
-    MAX_MANIFEST_BYTES,
-    TransitManifest,
-    parse_manifest,
-    read_manifest,
-)
+from psfcore.limited import run_limited
+from psfcore.transit.admission import ArchiveLimits, is_plain_name
+from psfcore.transit.manifest import MANIFEST_NAME, TransitManifest, parse_manifest, read_manifest
 from psfcore.transit.members import START_BYTES as START_BYTES
-from psfcore.transit.members import Kind, opened
+from psfcore.transit.members import Copied, Kind, copy_bytes, copy_files
 from psfcore.transit.members import archive_kind as archive_kind
 from psfcore.transit.members import could_be_archive as could_be_archive
 
-_CHUNK = 1 << 20
 _GZIP = b"\x1f\x8b"
 _FITS_STARTS = (b"SIMPLE  =", _GZIP)
 _HEADER_BYTES = 4 * 2880  # contain the header of the first image, also if it is compressed in an extension
 _AXIS = re.compile(rb"(Z?NAXIS[12]) *= +(\d{1,9}) ")
+SECONDS, BYTES_A_SECOND = (
+    10,
+    20_000_000,
+)  # processor time that an archive may take; headers can be made to take long
 BYTES_A_PIXEL = 4  # of a file whose start does not tell its shape
 
 
@@ -65,7 +63,7 @@ class FolderTransit:
 
 
 def list_archive(path: str | Path, limits: ArchiveLimits) -> ArchiveContents:
-    """List an archive. The function reads transit.json and the first bytes of every other file, and writes nothing.
+    """List an archive. The function reads transit.json and the first bytes of every other file.
 
     A .zip has a table of contents, and in a .tar the data can be skipped. A .tar.gz must be decompressed from start to
     end, within the limits.
@@ -78,19 +76,16 @@ def list_archive(path: str | Path, limits: ArchiveLimits) -> ArchiveContents:
 
     If several files are missing or cannot be FITS files, one error names all of them.
     """
-    sizes: dict[str, dict[str, int]] = {}  # by folder of the archive
-    starts: dict[str, dict[str, bytes]] = {}
-    with opened(Path(path), limits) as archive:
-        for member in archive.members:
-            count = MAX_MANIFEST_BYTES + 1 if member.name == MANIFEST_NAME else _HEADER_BYTES
-            sizes.setdefault(member.folder, {})[member.name] = member.size_bytes
-            starts.setdefault(member.folder, {})[member.name] = member.read(count)
-        main, kind = archive.gate.main_folder(), archive.kind
-    files, first = sizes.get(main, {}), starts.get(main, {})
-    content = first.pop(MANIFEST_NAME, None)
-    if content is None:
+    with _files_in(Path(path), limits, start_bytes=_HEADER_BYTES) as (kind, found, source):
+        first = {}
+        for file in found:
+            source.seek(file.at)
+            first[file.name] = source.read(file.length)
+    described = first.pop(MANIFEST_NAME, None)
+    if described is None:
         raise DataError("no-manifest", f"expected a file {MANIFEST_NAME} in the archive; add it")
-    manifest = parse_manifest(content)
+    manifest = parse_manifest(described)
+    files = {file.name: file.size_bytes for file in found}
     _check_files(manifest, first, "the archive")
     return ArchiveContents(kind, manifest, files, _pixels(manifest, first, files))
 
@@ -110,36 +105,51 @@ def unpack(path: str | Path, folder: str | Path, limits: ArchiveLimits) -> tuple
     - "archive-broken" if the archive is damaged.
     """
     folder = Path(folder)
-    written: list[tuple[str, Path]] = []  # folder of the archive, and path
-    # By folder of the archive. No file has the name of a folder below, because file names do not begin with a full stop.
-    staged = {"": folder}
     with ExitStack() as undo:
         if not folder.exists():
             folder.mkdir(parents=True)
             undo.callback(folder.rmdir)
-        with opened(Path(path), limits) as archive:
-            for member in archive.members:
-                if member.folder not in staged:
-                    staged[member.folder] = folder / f".{len(staged)}"
-                    staged[member.folder].mkdir()
-                    undo.callback(shutil.rmtree, staged[member.folder], ignore_errors=True)
-                target = staged[member.folder] / member.name
-                with target.open("xb") as file:
+        with _files_in(Path(path), limits, scratch=folder) as (kind, found, source):
+            for file in reversed(found):
+                target = folder / file.name
+                with target.open("xb") as plain:
                     undo.callback(target.unlink, missing_ok=True)
-                    while chunk := member.read(_CHUNK):
-                        file.write(chunk)
-                written.append((member.folder, target))
-            main = archive.gate.main_folder()
-        kept = [target for beside, target in written if beside == main]
-        for target in kept:
-            if target.parent != folder:
-                undo.callback((folder / target.name).unlink, missing_ok=True)
-                target.rename(folder / target.name)
-        for beside, there in staged.items():
-            if beside:
-                shutil.rmtree(there)
+                    source.seek(file.at)
+                    copy_bytes(source, plain, file.length, file.name)
+                if kind != "tar":
+                    source.truncate(file.at)  # no byte is on the disk twice
         undo.pop_all()  # success: keep the files
-    return tuple(target.name for target in kept)
+    return tuple(file.name for file in found)
+
+
+@contextmanager
+def _files_in(
+    path: Path, limits: ArchiveLimits, *, scratch: Path | None = None, start_bytes: int | None = None
+) -> Iterator[tuple[Kind, list[Copied], BinaryIO]]:
+    """The kind of an archive, its files in their order, and the file with their plain bytes.
+
+    scratch: the folder of a temporary file. start_bytes: the number of bytes that are needed of each file (``copy_files``).
+    """
+    with path.open("rb") as archive, TemporaryFile(dir=scratch) as temporary:
+        content = cast(BinaryIO, temporary)
+        size = path.stat().st_size
+        bounds = asdict(limits.of_archive(size))
+        seconds = SECONDS + size // BYTES_A_SECOND
+        try:
+            answer = run_limited(
+                copy_files, path, content, pixels=0, seconds=seconds, limits=bounds, start_bytes=start_bytes
+            )
+        except DataError as error:
+            if error.code != "unreadable-pixels":
+                raise
+            message = "expected an archive that is read in the memory and time that its size explains; got one that needs more"
+            raise DataError(
+                "archive-broken", f"{message}: pack the files again, for example as .zip"
+            ) from None
+        found = [Copied(*row) for row in answer["files"]]
+        if not all(is_plain_name(file.name) for file in found):  # the process may have been misused
+            raise DataError("archive-broken", "expected plain file names; got others: pack the archive again")
+        yield answer["kind"], found, archive if answer["kind"] == "tar" else content
 
 
 def pack(folder: str | Path, path: str | Path) -> TransitManifest:

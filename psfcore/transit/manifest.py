@@ -13,7 +13,6 @@ files of a newer version can be read.
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -22,30 +21,18 @@ from pydantic_core import ErrorDetails
 
 from psfcore.errors import DataError
 from psfcore.noise import NoiseFigures
+from psfcore.transit.admission import MANIFEST_NAME as MANIFEST_NAME
+from psfcore.transit.admission import MAX_MANIFEST_BYTES as MAX_MANIFEST_BYTES
+from psfcore.transit.admission import is_plain_name
 
-MANIFEST_NAME = "transit.json"
 MAX_IMAGES = 2000
 MOST_FAULTS = 8  # wrong values that a message names
-MAX_MANIFEST_BYTES = 4 * 2**20
 # Every value of a JSON text except the first follows one of these characters. Python needs about 100 bytes for a value,
 # so the number of values is limited before the text is read. An image of today's format has 5 values.
 _BEFORE_VALUES = (b",", b"[", b"{")
 MAX_VALUES = 64 * MAX_IMAGES
 FARTHEST_PX = 1e6
 LARGEST_RADIUS_PX = 4096.0
-_DRIVE = re.compile(r"[A-Za-z]:")
-
-
-def is_plain_name(name: str) -> bool:
-    """True for the name of a file inside a folder: no path, no "..", no drive letter, only printable characters."""
-    return (
-        0 < len(name.encode("utf-8", "replace")) <= 255
-        and name.isprintable()
-        and not set("/\\") & set(name)
-        and name not in (".", "..")
-        and name == name.strip()
-        and _DRIVE.match(name) is None
-    )
 
 
 def _plain(name: str) -> str:

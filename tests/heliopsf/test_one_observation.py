@@ -6,6 +6,7 @@ import pickle
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ import heliopsf
 from heliopsf import DataError, Deconvolution
 from heliopsf.inputs import image_of, on_disk
 from psfcore.deconvolve.assess.changes import QualityBit
+from psfcore.fits.cards import number_of
 from psfcore.image import Image
 
 N = 128
@@ -293,6 +295,27 @@ def test_numbers_of_metadata_may_be_of_any_type(psf_file: Path) -> None:
         heliopsf.deconvolve(
             NDData(scene(), meta=AIA | {"WAVELNTH": np.float32(171)}), aia_193(psf_file), steps=1
         )
+
+
+def test_what_is_no_number_and_masks_that_broadcast() -> None:
+    for nothing in (Decimal("NaN"), np.ma.masked, np.inf, True, 1 + 2j, "1_000", 10**400):
+        assert number_of(nothing) is None, nothing
+    assert number_of(np.longdouble(2)) == number_of(Decimal(2)) == number_of("2D0") == 2.0
+    column = np.zeros(N, bool)
+    column[3] = True
+    assert np.argwhere(observed(NDData(scene(), mask=column, meta=AIA)).mask)[:, 1].tolist() == [3] * N
+    with pytest.raises(DataError, match="mask-shape"):
+        observed(NDData(scene(), mask=np.zeros((10, N), bool), meta=AIA))
+
+
+def test_a_region_of_another_hdu_is_that_of_this_hdu(psf_file: Path) -> None:
+    hdus = fits.HDUList([fits.PrimaryHDU(scene()[:32, :32]), fits.ImageHDU(scene(), fits.Header(AIA))])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        cut = heliopsf.deconvolve(
+            hdus, psf_file, hdu=1, region=np.s_[0:40, 0:40], steps=1, other_channel=True, full=True
+        )
+    assert cut.pixels.shape == (40, 40)
 
 
 def aia_193(psf_file: Path) -> Path:

@@ -7,6 +7,7 @@ import os
 import resource
 import signal
 import socket
+import stat
 import sys
 import threading
 import time
@@ -30,6 +31,10 @@ def work(target: BinaryIO, *, path: str, kind: str) -> dict[str, Any]:
     """What the child does."""
     if kind == "crash":
         ctypes.string_at(0)
+    if kind == "spin":
+        resource.setrlimit(resource.RLIMIT_CPU, (1, resource.getrlimit(resource.RLIMIT_CPU)[1]))
+        while True:
+            pass
     if kind == "memory":
         return {"length": len(bytearray(600 * MIB))}
     if kind == "refuse":
@@ -71,6 +76,15 @@ def reached(what: str) -> dict[str, Any]:
             os.execv("/bin/true", ["true"])
         elif name == "signal":
             os.kill(int(place), signal.SIGTERM)
+        elif name == "fork":
+            if os.fork() == 0:
+                os._exit(0)
+        elif name == "mode":
+            os.chmod(place, 0o666)
+        elif name == "owner":
+            return {"found": stat.S_ISSOCK(os.fstat(0).st_mode)}
+        elif name == "thread":
+            threading.Thread(target=lambda: None).start()
     except PermissionError:
         return walls()
     return {"found": what}
@@ -100,7 +114,7 @@ def test_the_answer_and_what_is_written(path: Path, monkeypatch: pytest.MonkeyPa
     assert len({about["process"] for about, _ in several}) == 12
 
 
-@pytest.mark.parametrize("kind", ["crash", "memory"])
+@pytest.mark.parametrize("kind", ["crash", "memory", "spin"])
 def test_a_child_that_crashes_or_takes_too_much_is_an_error_of_the_file(path: Path, kind: str) -> None:
     with pytest.raises(DataError, match=r"unreadable-pixels: .*crashed, or needed much more memory or time"):
         answer(path, kind)
@@ -148,11 +162,14 @@ def test_the_child_reaches_its_file_and_nothing_else(path: Path) -> None:
         others = [f"read {secret}", "read /etc/passwd", f"read /proc/{os.getpid()}/environ"]
         others += [f"list {path.parent}", f"write {path}", f"write {path.parent / 'new'}"]
         beyond = {"files": others, "calls": [f"socket {port}", "exec", f"signal {os.getpid()}"]}
+        beyond["calls"] += ["fork", f"mode {secret}"]
         acting = limited.acting(path)
         for what in (one for part, several in beyond.items() if acting[part] for one in several):
             assert answer(path, f"wall {what}")[0] == acting, what
         if not all(acting.values()):
             pytest.skip(f"this kernel has not all parts of the wall: {acting}")
+    assert answer(path, "wall thread")[0] == {"found": "thread"}, "libraries may start threads"
+    assert answer(path, "wall owner")[0] == {"found": False}, "the socket over which other requests come"
     assert path.read_bytes() == b"abc" and not (path.parent / "new").exists()
 
 

@@ -247,6 +247,56 @@ def test_lost_blocks_are_masked_and_dark_pixels_are_not() -> None:
     ]
 
 
+def test_rows_that_were_not_received_and_counts_that_wrapped() -> None:
+    """Rows of zeros beside a faint corona, whose own zeros stay; and a peak that passes through all negative numbers of 16 bits."""
+    rng = np.random.default_rng(5)
+    y, x = np.indices((256, 256))
+    faint = rng.poisson(np.where(np.hypot(y - 128, x - 128) < 90, 300.0, 1.5)).astype(float)
+    assert "zeros" not in observation_of(faint, header()).warnings
+    cut = faint.copy()
+    cut[200:] = 0
+    image = observation_of(cut, header())
+    np.testing.assert_array_equal(~image.finite, y >= 200)
+    assert f"{56 * 256} pixels" in image.warnings["zeros"]
+    for height in (45_000, 62_000, 64_000):
+        peak = np.rint(
+            800 + height * np.exp(-((x - 100) ** 2 + (y - 90) ** 2) / 60) + rng.normal(0, 3, x.shape)
+        )
+        stored = (peak + 32768) % 65536 - 32768
+        image = observation_of(stored, header(), bits=16)
+        np.testing.assert_array_equal(~image.finite, stored < 0)
+        assert "wrapped" in image.warnings
+    for quiet in (rng.normal(0, 400, (64, 64)).round(), rng.normal(20_000, 9_000, (64, 64)).round()):
+        assert "wrapped" not in observation_of(quiet, header(), bits=16).warnings
+
+
+def test_counts_of_saturated_pixels_that_make_no_sense() -> None:
+    """A negative count, one that is larger than the image, and one of a whole exposure beside a quiet cut-out."""
+    for count in (-1, -9999, 10**6):
+        for cards in ({}, {"BUNIT": "DN/s", "EXPTIME": None}):
+            image = observation_of(scene(), header(NSATPIX=count, **cards))
+            assert image.valid.all(), (count, cards)
+    quiet = np.random.default_rng(6).poisson(200, (128, 128)).astype(float)
+    image = observation_of(quiet, header(BUNIT="DN/s", EXPTIME=None, NSATPIX=100))
+    assert (
+        image.valid.all()
+        and image.saturation is not None
+        and "exposure time" in str(image.saturation.warning)
+    )
+
+
+def test_planes_belong_to_the_first_image_and_all_are_told(tmp_path: Path) -> None:
+    bad = np.zeros((64, 64), np.uint8)
+    bad[3, 4] = 1
+    errors = np.ones((64, 64))
+    errors[5, 6] = np.inf
+    hdus = [fits.PrimaryHDU(scene()), fits.ImageHDU(bad, name="DQF"), fits.ImageHDU(errors, name="ERR")]
+    more = fits.ImageHDU(scene(), name="SECOND"), fits.ImageHDU(0 * bad, name="DQF")
+    image = read_observation(write(tmp_path / "planes.fits", *hdus, *more), LIMITS)
+    assert np.argwhere(image.mask).tolist() == [[3, 4], [5, 6]]
+    assert all(name in image.warnings["quality-plane"] for name in ("DQF", "ERR"))
+
+
 def test_what_is_no_exposure_is_refused() -> None:
     for cards, code in (
         ({"IMG_TYPE": "DARK"}, "not-an-exposure"),
