@@ -7,7 +7,6 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
 
-import anyio
 from fastapi import FastAPI
 
 from psfcore.fits.viewing.planes import Planes
@@ -26,6 +25,7 @@ from service.api import (
     transits,
 )
 from service.http import guard, observation, problems
+from service.http.gate import Gate
 from service.http.rates import AtOnce, Rates
 from service.http.state import Access, State
 from service.pages import assets, login
@@ -46,7 +46,7 @@ from workers.settings import Settings, software_version
 
 SHORT = re.compile(r"\^\[0-9a-f\]\{(32|64)\}\$")
 PROBLEM = f"#/components/schemas/{problems.ProblemDocument.__name__}"
-AT_ONCE = 2  # cut-outs that are made, planes that are decoded, uploads that are inspected
+AT_ONCE = 3  # works behind a gate; one owner alone gets all places but one
 
 
 def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
@@ -80,9 +80,8 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
             rates,
             streams,
             requests,
-            cutouts=anyio.CapacityLimiter(AT_ONCE),
-            decoding=anyio.CapacityLimiter(AT_ONCE),
-            inspecting=anyio.CapacityLimiter(AT_ONCE),
+            pixels=Gate(AT_ONCE),
+            stored=Gate(AT_ONCE),
             planes=Planes(store.temporary),
         )
         reconciler.start()

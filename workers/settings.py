@@ -183,25 +183,27 @@ class Settings(BaseSettings):
     )
     max_bulk_body_mib: int = Field(16, ge=1, le=1024, description="largest request for a bulk run, MiB")
     reads_per_minute: int = Field(
-        12_000, ge=0, description="largest number of read requests of one caller per minute; 0: unlimited"
+        12_000,
+        ge=0,
+        description="largest number of read requests of one owner (without keys: of one address) per minute; 0: unlimited",
     )
     submissions_per_minute: int = Field(
         3_000,
         ge=0,
-        description="largest number of uploads and submitted jobs of one caller per minute; 0: unlimited",
+        description="largest number of uploads and submitted jobs of one owner per minute; 0: unlimited",
     )
     upload_mib_per_minute: int = Field(
-        16_384, ge=0, description="largest size of the uploads of one caller per minute, MiB; 0: unlimited"
+        16_384, ge=0, description="largest size of the uploads of one owner per minute, MiB; 0: unlimited"
     )
     requests_per_caller: int = Field(
         128,
         ge=1,
-        description="largest number of requests of one caller that one server answers at a time, event streams included",
+        description="largest number of requests of one owner that one server answers at a time, event streams included",
     )
     streams_per_caller: int = Field(
         32,
         ge=1,
-        description="largest number of event streams that one caller may have open on one server at a time",
+        description="largest number of event streams that one owner may have open on one server at a time",
     )
     stream_s: float = Field(
         3600.0, gt=0, description="longest duration of an event stream, s; then the client must connect again"

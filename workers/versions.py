@@ -43,6 +43,7 @@ from psfcore.fits.header import (
 )
 from psfcore.instruments.files import PLATE_SCALE_TOLERANCE
 from psfcore.instruments.unknown import channel_of as channel_of
+from workers.texts import printable
 
 # Series ---------------------------------------------------------------------------------------------
 
@@ -276,4 +277,4 @@ def name_of_upload(summary: HeaderSummary, filename: str | None, sha256: str) ->
 
 def label(text: str | None, most: int) -> str:
     """The printable characters of a text that a file or a client chose, at most ``most`` of them."""
-    return "".join(c for c in (text or "")[: 2 * most] if c.isprintable())[:most].strip()
+    return printable((text or "")[: 2 * most])[:most].strip()

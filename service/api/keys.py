@@ -21,8 +21,8 @@ from service.http.state import Shared
 from service.views import RowView
 from workers.catalogue.access import LABEL_LENGTH, OWNER, Scope, TooManyKeys
 from workers.catalogue.tables import KeyRow
-from workers.contract.requests import PRINTABLE_OR_EMPTY
 from workers.rows import no_such
+from workers.texts import Line
 
 MOST_KEYS = 100  # an owner with this number of valid keys cannot make more
 DAY_S = 86_400.0
@@ -39,9 +39,8 @@ class NewKey(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    label: str = Field(
+    label: Line = Field(
         "",
-        pattern=PRINTABLE_OR_EMPTY,
         max_length=LABEL_LENGTH,
         description="a note for lists, such as the purpose of the key",
     )

@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any, BinaryIO, Literal
 
-import anyio.to_thread
 from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import JSONResponse, StreamingResponse
@@ -100,7 +99,7 @@ async def get_image_pixels(
 ) -> Response:
     """The pixel values of the file, in DN or DN/s as they are stored (BSCALE and BZERO applied). Saturated pixels are not marked."""
     await run_in_threadpool(state.row, ImageRow, image_id, caller.owner)
-    return await _pixels(request, state, image_id, plane, part)
+    return await _pixels(request, state, caller.owner, image_id, plane, part)
 
 
 @router.get(
@@ -125,16 +124,18 @@ async def get_product_pixels(
     """The pixel values of a plane of the product. Values of `quality` are whole numbers, as in the file. 404: the product does not
     have this plane."""
     row = await run_in_threadpool(state.row, ProductRow, product_id, caller.owner)
-    return await _pixels(request, state, row.file_sha256, plane, part)
+    return await _pixels(request, state, caller.owner, row.file_sha256, plane, part)
 
 
-async def _pixels(request: Request, state: Shared, digest: str, name: str, part: Part) -> Response:
+async def _pixels(
+    request: Request, state: Shared, owner: str, digest: str, name: str, part: Part
+) -> Response:
     """A part of a plane of a stored file, or 304 if the client already has it."""
     sent = files.headers_of(f"{ANSWERS_VERSION} {digest} pixels {name} {part}")
     if (same := files.not_modified(request, sent)) is not None:
         return same
     with as_problems():
-        plane = await _plane(state, digest, name)
+        plane = await _plane(state, owner, digest, name)
         shape, length, pieces = await run_in_threadpool(_cut, plane, part, name == QUALITY)
     sent["X-Plane-Shape"] = "{},{}".format(*plane.shape)
     sent["X-Pixels-Shape"] = "{},{}".format(*shape)
@@ -144,16 +145,18 @@ async def _pixels(request: Request, state: Shared, digest: str, name: str, part:
     return StreamingResponse(pieces, media_type=MEDIA_TYPE, headers=sent)
 
 
-async def prepare_image(state: State, digest: str) -> None:
+async def prepare_image(state: State, owner: str, digest: str) -> None:
     """Decode the image of a stored file in advance, so that a later request for its pixels is answered at once.
 
     If the file cannot be decoded, this function raises no error; the later request gets the error.
     """
     with contextlib.suppress(DataError, Problem):
-        await _plane(state, digest, IMAGE)
+        await _plane(state, owner, digest, IMAGE)
 
 
-async def picture_of(request: Request, state: State, digest: str, core_px: int | None = None) -> Response:
+async def picture_of(
+    request: Request, state: State, owner: str, digest: str, core_px: int | None = None
+) -> Response:
     """A picture of the image in a stored file as PNG, or 304 if the client already has it. core_px: of the central part of a
     PSF, with this width."""
     sent = files.headers_of(f"{ANSWERS_VERSION} {digest} picture {core_px}")
@@ -166,15 +169,15 @@ async def picture_of(request: Request, state: State, digest: str, core_px: int |
         return core_picture(plane, core_px) if core_px else picture(plane, PICTURE_PX)
 
     with as_problems():
-        png = await run_in_threadpool(draw, await _plane(state, digest, IMAGE))
+        png = await run_in_threadpool(draw, await _plane(state, owner, digest, IMAGE))
     return Response(png, media_type="image/png", headers=sent)
 
 
-async def _plane(state: State, digest: str, name: str) -> Plane:
+async def _plane(state: State, owner: str, digest: str, name: str) -> Plane:
     """A plane of a stored file, decoded now unless it is still kept."""
     plane = state.planes.kept((digest, name))
     if plane is None:
-        plane = await anyio.to_thread.run_sync(_decoded, state, digest, name, limiter=state.decoding)
+        plane = await state.pixels.run(owner, _decoded, state, digest, name)
     return plane
 
 
@@ -211,7 +214,7 @@ class HduHeader(BaseModel):
 async def get_image_header(image_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """Every card of every HDU, with COMMENT and HISTORY. A tile-compressed image has the header of the table that holds it."""
     row = await run_in_threadpool(state.row, ImageRow, image_id, caller.owner)
-    return await _headers(request, state, image_id, row.bytes)
+    return await _headers(request, state, caller.owner, image_id, row.bytes)
 
 
 @headers.get(
@@ -222,10 +225,10 @@ async def get_product_header(
 ) -> Response:
     """Every card of the image and of its planes, with COMMENT and HISTORY."""
     row = await run_in_threadpool(state.row, ProductRow, product_id, caller.owner)
-    return await _headers(request, state, row.file_sha256, row.bytes)
+    return await _headers(request, state, caller.owner, row.file_sha256, row.bytes)
 
 
-async def _headers(request: Request, state: Shared, digest: str, size: int) -> Response:
+async def _headers(request: Request, state: Shared, owner: str, digest: str, size: int) -> Response:
     sent = files.headers_of(f"{ANSWERS_VERSION} {digest} header")
     if (same := files.not_modified(request, sent)) is not None:
         return same
@@ -236,5 +239,4 @@ async def _headers(request: Request, state: Shared, digest: str, size: int) -> R
         return JSONResponse(content, headers=sent)
 
     with as_problems():
-        # Reading thousands of cards takes a second. The limiter bounds how many requests read cards or pixels at once.
-        return await anyio.to_thread.run_sync(read, limiter=state.decoding)
+        return await state.stored.run(owner, read)  # thousands of cards take a second

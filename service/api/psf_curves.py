@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any
 
-import anyio.to_thread
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import JSONResponse, StreamingResponse
@@ -170,7 +169,7 @@ async def get_cutout(
         return cutout(files.path_of(state.store, row.file_sha256, row.bytes), size, state.settings.psf_limits)
 
     with as_problems():
-        part = await anyio.to_thread.run_sync(cut, limiter=state.cutouts)
+        part = await state.pixels.run(caller.owner, cut)
     headers["Content-Disposition"] = f'attachment; filename="psf-{psf_id[:12]}-{size}px.fits"'
     headers["Content-Length"] = str(part.length)
     return StreamingResponse(part.pieces(), media_type=files.FITS_TYPE, headers=headers)

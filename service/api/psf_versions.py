@@ -10,7 +10,6 @@ from typing import Annotated
 from fastapi import APIRouter, Path, Query, Response
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
-from service.api.psfs import TEXT
 from service.http.callers import Caller, Certifying, KeyFirst, Reading
 from service.http.paging import Page, Paging, finite, identity, place
 from service.http.problems import RESPONSES, as_problems
@@ -21,6 +20,7 @@ from workers.catalogue.contexts import NAME, Pin
 from workers.catalogue.psfs import StatusAsked
 from workers.catalogue.tables import PsfContextRow, PsfRow
 from workers.contract.requests import ContextName, Identity
+from workers.texts import Lines
 from workers.versions import MAY_BECOME, TIME, WORD, PsfStatus, Validity, iso, next_version
 
 log = logging.getLogger(__name__)
@@ -34,9 +34,7 @@ Time = Annotated[
 ]
 # A time of the catalogue, seconds since 1970, as ISO 8601; null for none and for an open end.
 ShownTime = Annotated[str | None, BeforeValidator(lambda at: iso(at) if isinstance(at, float) else at)]
-Reason = Annotated[
-    str, Field(max_length=400, pattern=TEXT, description="the reason, stored for later readers")
-]
+Reason = Annotated[Lines, Field(max_length=400, description="the reason, stored for later readers")]
 Word = Annotated[str, Field(pattern=WORD)]
 Instrument = Annotated[str, Path(pattern=WORD, description="such as `hri_euv`")]
 Channel = Annotated[

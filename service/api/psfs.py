@@ -21,17 +21,17 @@ from service.views import PsfView
 from workers.catalogue.contexts import NOW
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import ImageRow, PsfRow
-from workers.contract.requests import PRINTABLE, Identity
+from workers.contract.requests import Identity
 from workers.files.collection import remove_unnamed
 from workers.intake.psf_choice import MOST_NAMED, Found, look, look_for_image
+from workers.texts import Name
 from workers.versions import TIME, TOTAL, WORD, PsfStatus, iso, seconds
 
 log = logging.getLogger(__name__)
 router = APIRouter(prefix="/v1/psfs", tags=["PSFs"], responses=RESPONSES)
 choosing = APIRouter(tags=["PSFs"], responses=RESPONSES)
 
-TEXT = r"^[^\x00-\x08\x0b-\x1f\x7f]*$"  # for free text: PostgreSQL cannot store NUL
-Text = Annotated[str | None, Query(max_length=80, pattern=PRINTABLE)]
+Text = Annotated[Name | None, Query(max_length=80)]
 Time = Annotated[
     str | None,
     Query(
@@ -40,10 +40,9 @@ Time = Annotated[
     ),
 ]
 InContext = Annotated[
-    str | None,
+    Name | None,
     Query(
         max_length=64,
-        pattern=PRINTABLE,
         description=f"id or name of a context; `{NOW}`: the PSFs that are certified now",
     ),
 ]
@@ -59,14 +58,13 @@ KindOfUpload = Annotated[
 def psf_filter(
     instrument: Text = None,
     channel: Annotated[
-        str | None,
-        Query(max_length=40, pattern=PRINTABLE, description="wavelength in whole angstrom, such as 174"),
+        Name | None,
+        Query(max_length=40, description="wavelength in whole angstrom, such as 174"),
     ] = None,
     kind: Annotated[
-        str | None,
+        Name | None,
         Query(
             max_length=40,
-            pattern=PRINTABLE,
             description="`total`, `uploaded`, or a component's name such as `diffraction`",
         ),
     ] = None,
@@ -175,11 +173,11 @@ async def upload_psf(
     caller: Submitting,
     state: Shared,
     name: Annotated[
-        str | None,
-        Query(max_length=80, pattern=PRINTABLE, description="default: PSFNAME, or the file's name"),
+        Name | None,
+        Query(max_length=80, description="default: PSFNAME, or the file's name"),
     ] = None,
     version: Annotated[
-        str | None, Query(max_length=40, pattern=PRINTABLE, description="default: PSFVERS, or 0.0.0+hash")
+        Name | None, Query(max_length=40, description="default: PSFVERS, or 0.0.0+hash")
     ] = None,
     instrument: Annotated[
         str | None, Query(pattern=WORD, description="default: DETECTOR or INSTRUME")

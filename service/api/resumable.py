@@ -15,7 +15,6 @@ from contextlib import ExitStack, contextmanager
 from email.utils import formatdate
 from typing import Annotated, Any, BinaryIO
 
-import anyio.to_thread
 from fastapi import APIRouter, Path, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
@@ -163,9 +162,7 @@ async def send_part(upload_id: UploadId, request: Request, caller: Submitting, s
         await _append(request, file, upload, Allowed(state, caller, upload.id))
         if file.tell() < upload.length:
             return _described(204, open_uploads, upload)
-        location = await anyio.to_thread.run_sync(
-            _complete, open_uploads, upload, caller, state, limiter=state.inspecting
-        )
+        location = await state.pixels.run(caller.owner, _complete, open_uploads, upload, caller, state)
     return _answer(204, {"Upload-Offset": str(upload.length), "Content-Location": location})
 
 

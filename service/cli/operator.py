@@ -31,6 +31,7 @@ from workers.files.modes import keep_private, private_folder
 from workers.files.store import open_store
 from workers.intake.again import repair
 from workers.intake.uploads import uploaded_psf_row
+from workers.texts import check_line
 from workers.versions import TOTAL
 
 DAY_S = 86_400
@@ -285,6 +286,7 @@ def key() -> None:
 @click.option(
     "--label",
     default="",
+    callback=lambda _context, _option, text: _label(text),
     show_default=False,
     help="Note that `key list` shows, for example the purpose of the key",
 )
@@ -356,6 +358,13 @@ def _described(row: KeyRow) -> dict[str, object]:
     """A key as JSON, without its hash."""
     shown = ("id", "owner", "scopes", "label", "created_at", "expires_at", "revoked_at", "last_used_at")
     return {name: getattr(row, name) for name in shown} | {"state": _state(row)}
+
+
+def _label(text: str) -> str:
+    try:
+        return check_line(text)
+    except ValueError as error:
+        raise click.BadParameter(str(error)) from error
 
 
 def _day(seconds: float) -> str:

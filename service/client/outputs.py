@@ -10,6 +10,7 @@ from pathlib import Path
 
 from psfcore.files import check_ending, probe, whole_path
 from service.client.errors import ServiceError
+from workers.texts import printable
 
 Name = str | Path
 _File = tuple[int, int] | str
@@ -82,7 +83,7 @@ def base_name(name: str) -> str:
     The result can be empty.
     """
     last = re.split(r"[/\\]", name)[-1]
-    return "".join(c for c in last if c.isprintable()).lstrip(".")[:200]
+    return printable(last).lstrip(".")[:200]
 
 
 def _files_in(path: Path) -> Iterator[Path]:

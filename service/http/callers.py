@@ -32,7 +32,7 @@ from fastapi.routing import APIRoute
 from fastapi.security import HTTPBearer, SecurityScopes
 from fastapi.security.http import HTTPBase
 
-from service.http.guard import BULK, SAFE_METHODS, JsonRequest
+from service.http.guard import BULK, SAFE_METHODS, JsonRequest, cookie_name
 from service.http.problems import Problem, problem
 from service.http.rates import Bucket
 from service.http.state import Shared, State, state_of
@@ -55,7 +55,6 @@ from workers.rows import no_such
 
 ACT_FOR = "X-Owner"  # names the owner that an administrator acts for
 FORM_TOKEN = "X-Form-Token"
-SESSION_COOKIE = "heliopsf_session"
 # The parts of addresses that are ids: the table, the name of the thing, and the digits of a whole id.
 IDS: dict[str, tuple[type[ListedRow], str, int]] = {
     "image_id": (ImageRow, "image", 64),
@@ -77,7 +76,8 @@ class Caller:
 
     owner: str
     scopes: frozenset[Scope]
-    name: str  # for rate limits and logs: the id of the key, or the address
+    name: str  # for logs: the id of the key, or the address
+    account: str  # what limits count by: the owner of the key, or the address in a service without keys
     session: str | None = None  # the id of the browser's session, if a cookie let the request in
 
 
@@ -110,8 +110,8 @@ def admit(request: Request, state: State, scopes: Iterable[str], form_token: str
     """
     caller = _let_in(request, state, form_token or request.headers.get(FORM_TOKEN, ""))
     request.state.caller = caller
-    state.requests.open(caller.name)
-    request.state.at_end = lambda: state.requests.close(caller.name)  # called by service.http.guard
+    state.requests.open(caller.account)
+    request.state.at_end = lambda: state.requests.close(caller.account)  # called by service.http.guard
     for scope in map(Scope, scopes):
         if scope not in caller.scopes:
             raise Problem(
@@ -121,7 +121,7 @@ def admit(request: Request, state: State, scopes: Iterable[str], form_token: str
             )
         reading = scope in (Scope.READ, Scope.ADMIN)
         bucket = Bucket.READS if reading else Bucket.SUBMISSIONS
-        request.state.allowance = state.rates.take(bucket, caller.name)
+        request.state.allowance = state.rates.take(bucket, caller.account)
     # Parameters of the path are read after this dependency, so every route gets whole ids.
     _complete_ids(request, state, caller.owner)
     return caller
@@ -153,13 +153,9 @@ def address_of(request: Request) -> str:
     return request.client.host if request.client is not None else "unknown"
 
 
-def cookie_name(request: Request) -> str:
-    """The name of the cookie of a session.
-
-    Browsers accept a cookie with the prefix ``__Host-`` only over HTTPS and only from this host. So no other host of
-    the domain can set such a cookie.
-    """
-    return f"__Host-{SESSION_COOKIE}" if request.url.scheme == "https" else SESSION_COOKIE
+def session_token(request: Request) -> str | None:
+    """The token in the cookie of the session; None without this cookie. ``service.http.guard`` let no other cookie through."""
+    return request.cookies.get(cookie_name(request.url.scheme))
 
 
 def still_let_in(state: State, caller: Caller) -> bool:
@@ -173,13 +169,14 @@ def still_let_in(state: State, caller: Caller) -> bool:
 
 def _let_in(request: Request, state: State, form_token: str) -> Caller:
     if not state.access.keys:
-        return Caller(DEFAULT_OWNER, frozenset(Scope), address_of(request))
+        address = address_of(request)
+        return Caller(DEFAULT_OWNER, frozenset(Scope), address, address)
     try:
         session, row = _session_and_key(request, state)
     except KeyRefused as refused:
         state.rates.take(Bucket.READS, address_of(request))  # this limits attempts to guess keys
         raise Problem(401, refused.code, refused.message, headers=_challenge(request)) from refused
-    caller = Caller(row.owner, frozenset(map(Scope, row.scopes)), row.id)
+    caller = Caller(row.owner, frozenset(map(Scope, row.scopes)), row.id, row.owner)
     if session is not None:
         _check_form_token(request, session, form_token)
         request.state.form_token = session.form_token  # the forms of pages contain it
@@ -201,7 +198,7 @@ def _session_and_key(request: Request, state: State) -> tuple[SessionRow | None,
 
     The session is None if the request has an Authorization header or no session cookie.
     """
-    token = request.cookies.get(cookie_name(request))
+    token = session_token(request)
     if token is None or "authorization" in request.headers:
         return None, state.catalogue.keys.check(_sent_key(request))
     return state.catalogue.sessions.find(token)
@@ -233,7 +230,7 @@ def _challenge(request: Request) -> dict[str, str]:
     """
     page = (
         request.headers.get("sec-fetch-site") == "same-origin"
-        or cookie_name(request) in request.cookies
+        or session_token(request) is not None
         or "application/xhtml+xml" in request.headers.get("accept", "")
     )
     return {"WWW-Authenticate": BEARER if page else f"{BEARER}, {BASIC}"}

@@ -13,13 +13,14 @@ import logging
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Generic, Self
 
-import anyio.to_thread
 from fastapi import Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import FileResponse, Response
+from starlette.types import Receive, Scope, Send
 
 from psfcore.fits.header import HeaderSummary, read_summary
 from psfcore.fits.stored_psf import check_is_psf
@@ -29,7 +30,7 @@ from service.http.callers import Caller
 from service.http.forms import FORM, URL_ENCODED, FormPart, chunks_of, media_type_of, pieces_of
 from service.http.problems import Problem, as_problems, problem
 from service.http.quotas import Allowed
-from service.http.state import State
+from service.http.state import State, state_of
 from workers.catalogue.catalogue import Row
 from workers.catalogue.tables import ImageRow, PsfRow, TransitRow
 from workers.files.store import BadFile, Store, lost
@@ -66,8 +67,21 @@ def send(
     headers = {"ETag": f'"{digest}"', "Cache-Control": KEPT, "Repr-Digest": f"sha-256=:{content}:"}
     if _client_has(request, headers["ETag"]):
         return Response(status_code=304, headers=headers)
-    path = path_of(store, digest, size)
-    return FileResponse(path, media_type=media_type, filename=filename, headers=headers)
+    find = partial(path_of, store, digest, size)
+    return _Stored(request, find, media_type=media_type, filename=filename, headers=headers)
+
+
+class _Stored(FileResponse):
+    """An answer with a stored file, which is fetched when it is the turn of the owner. The storage may be slow."""
+
+    def __init__(self, request: Request, find: Callable[[], Path], **options: Any) -> None:
+        super().__init__("", **options)
+        self._request, self._find = request, find
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        caller: Caller = self._request.state.caller
+        self.path = await state_of(self._request).stored.run(caller.owner, self._find)
+        await super().__call__(scope, receive, send)
 
 
 def headers_of(content: str) -> dict[str, str]:
@@ -279,12 +293,12 @@ async def add_upload(
     allowed = Allowed(state, caller)
     with state.store.temporary() as path, _advising(request):
         file = await _receive(request, path, state, kind, allowed)
-        summary = await anyio.to_thread.run_sync(kind.inspect, path, state, limiter=state.inspecting)
+        summary = await state.pixels.run(caller.owner, kind.inspect, path, state)
         there = None if equal is None else await run_in_threadpool(equal, file.sha256)
         if there is None:
             about = (caller.owner, file.sha256, file.bytes, label(file.filename))
             upload = kind.row(*about, summary, **(columns or {}))
-            row, new = await run_in_threadpool(allowed.keep, path, file.sha256, upload)
+            row, new = await state.stored.run(caller.owner, allowed.keep, path, file.sha256, upload)
         else:
             row, new = there, False
     response.status_code = 201 if new else 200

@@ -1,6 +1,10 @@
 """Checks every request before its route (host, origin, address, size of the body), and sets the security headers of every
 answer.
 
+A header costs time before any key is known. Therefore a long Cookie header is refused, and of the others only the cookie of
+the session goes on: FastAPI parses the cookies of every request with Python's library, whose time grew with the square of
+their length before Python 3.11.10 and 3.12.6 (CVE-2024-7592).
+
 A body costs memory and time before its content is known. Therefore its size is bounded while it arrives, and the values
 in JSON are counted before Python makes objects of these values. The proxy in front of the server bounds the time.
 
@@ -38,6 +42,8 @@ UWS_FORMS = re.compile(r"/uws/jobs(/[^/]+/parameters)?")
 # list or an object for each bracket, and pydantic may report an error for each member of an object.
 MOST_OF = {b"[": 25_000, b"{": 25_000, b":": 25_000, b",": 200_000}
 VO = ("/uws", "/vo/")
+COOKIE_BYTES = 4096
+SESSION_COOKIE = "heliopsf_session"
 # NUL, which PostgreSQL cannot store, and halves of surrogate pairs, which UTF-8 cannot encode.
 NO_TEXT = re.compile("[\0\ud800-\udfff]")
 
@@ -63,9 +69,11 @@ class _Guard:
 
         headers = Headers(scope=scope)
         try:
+            _keep_own_cookie(scope, headers)  # first, because the page of a refusal reads the cookie too
             if scope["method"] not in SAFE_METHODS or not scope["path"].startswith(FOR_EVERYBODY):
                 self._check_host(headers)
             _check_origin(scope["method"], headers)
+            _check_framing(headers)
             if not scope["path"].startswith(VO):
                 check_text(scope["path"], unquote(scope["query_string"].decode("latin-1")))
             _check_form(scope["path"], headers)
@@ -178,6 +186,46 @@ def _check_origin(method: str, headers: Headers) -> None:
             "expected a request from a program or from a page of this service; got a request from a page of another site: "
             "open the page of this service in the browser, and send the form there",
         )
+
+
+def _check_framing(headers: Headers) -> None:
+    """Refuse a body whose length is given in two ways: a proxy may go by the other one, and the rest of the body would then
+    be read as a further request. The connection is closed, because nobody knows where the next request begins."""
+    if "transfer-encoding" in headers and "content-length" in headers:
+        raise Problem(
+            400,
+            "two-body-lengths",
+            "expected Content-Length or Transfer-Encoding; got both: send one of them",
+            headers={"Connection": "close"},
+        )
+
+
+def cookie_name(scheme: str) -> str:
+    """The name of the cookie of a session.
+
+    Browsers accept a cookie with the prefix ``__Host-`` only over HTTPS and only from this host. So no other host of
+    the domain can set such a cookie.
+    """
+    return f"__Host-{SESSION_COOKIE}" if scheme == "https" else SESSION_COOKIE
+
+
+def _keep_own_cookie(scope: Scope, headers: Headers) -> None:
+    """Leave only the cookie of the session in the headers of a request. Raises ``Problem`` 431 for more than
+    ``COOKIE_BYTES`` of cookies."""
+    sent = headers.getlist("cookie")
+    if not sent:
+        return
+    scope["headers"] = [(name, value) for name, value in scope["headers"] if name != b"cookie"]
+    if sum(map(len, sent)) > COOKIE_BYTES:
+        raise Problem(
+            431,
+            "cookies-too-long",
+            f"expected at most {COOKIE_BYTES} bytes of cookies; got more: delete the cookies of this site in the browser, or "
+            "send none with a key",
+        )
+    own = re.search(rf"(?:^|;) *({cookie_name(scope['scheme'])}=[\w-]+) *(?:;|$)", ";".join(sent), re.ASCII)
+    if own is not None:
+        scope["headers"].append((b"cookie", own[1].encode()))
 
 
 def _host_name(sent: str) -> str:

@@ -41,7 +41,7 @@ class Allowed:
             self._usage = _limited(self._state, self._caller.owner, self._upload_id)
         self._bytes += count
         _check_file(self._state, self._usage, self._bytes)
-        self._state.rates.take(Bucket.UPLOADS, self._caller.name, math.ceil(count / MIB))
+        self._state.rates.take(Bucket.UPLOADS, self._caller.account, math.ceil(count / MIB))
 
     def keep(self, file: Path, digest: str, row: Row) -> tuple[Row, bool]:
         """Store the uploaded file, and add its row to the catalogue; returns the row, and whether it is new.

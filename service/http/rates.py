@@ -1,5 +1,5 @@
 """Limits for each caller: reads, submissions and uploaded bytes per minute, and requests and streams that are open at the
-same time.
+same time. A caller is an owner with all keys of this owner, or an address if the service needs no key.
 
 If the broker is Redis, all servers count together in Redis; otherwise each process counts alone. Each caller has
 an allowance of its own, so that a runaway script does not delay the others.

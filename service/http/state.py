@@ -11,12 +11,13 @@ import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated
 
-import anyio
 from fastapi import Depends, Request
 
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.viewing.planes import Planes
 from service.client.errors import is_loopback
+from service.http.gate import Gate
+from service.http.lookout import Lookout
 from service.http.problems import as_problems
 from service.http.rates import AtOnce, Rates
 from workers.catalogue.catalogue import Catalogue, Row
@@ -89,14 +90,10 @@ class State:
     rates: Rates
     streams: AtOnce
     requests: AtOnce
-    # Limits how many cut-outs are made at once, because each keeps a core busy. Other requests wait without
-    # using a thread.
-    cutouts: anyio.CapacityLimiter
-    # The same for decoding planes and headers.
-    decoding: anyio.CapacityLimiter
-    # The same for the inspection of uploads.
-    inspecting: anyio.CapacityLimiter
+    pixels: Gate  # for pixels and whole files: decodings, cut-outs, inspections of uploads
+    stored: Gate  # for headers, and for stored files that are sent
     planes: Planes
+    lookouts: dict[str, Lookout] = field(default_factory=dict)  # by owner
     started_at: float = field(default_factory=time.time)
 
     @property

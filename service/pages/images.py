@@ -156,7 +156,7 @@ class Checked:
 async def picture(image_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
     """A picture of the image as it was uploaded."""
     await run_in_threadpool(state.row, ImageRow, image_id, caller.owner)
-    return await picture_of(request, state, image_id)
+    return await picture_of(request, state, caller.owner, image_id)
 
 
 @router.get("/images/{image_id}")
@@ -321,9 +321,9 @@ def product(product_id: Identity, request: Request, caller: PageReading, state: 
     # The viewer of this page asks for both images as soon as its scripts are loaded.
     soon = BackgroundTasks()
     if lost is None:
-        soon.add_task(prepare_image, state, row.file_sha256)
+        soon.add_task(prepare_image, state, row.owner, row.file_sha256)
     if image is not None and image_lost is None:
-        soon.add_task(prepare_image, state, image.id)
+        soon.add_task(prepare_image, state, image.owner, image.id)
     answer.background = soon
     return answer
 

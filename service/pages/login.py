@@ -24,9 +24,9 @@ from fastapi.security import SecurityScopes
 from pydantic import ValidationError
 
 from service.api.keys import KeyId, MadeKey, NewKey, list_keys, make_key, revoke_key
-from service.http.callers import BEARER, Caller, address_of, admit, cookie_name, names_its_site
+from service.http.callers import BEARER, Caller, address_of, admit, names_its_site, session_token
 from service.http.forms import URL_ENCODED, media_type_of
-from service.http.guard import SAFE_METHODS
+from service.http.guard import SAFE_METHODS, cookie_name
 from service.http.paging import Cursor, Listing
 from service.http.problems import Problem
 from service.http.rates import Bucket
@@ -86,7 +86,7 @@ async def _form_token(request: Request) -> str | None:
     """The form token in the fields of a form; None if the form has no token or none is needed."""
     if request.method in SAFE_METHODS or names_its_site(request):
         return None
-    if cookie_name(request) not in request.cookies:
+    if session_token(request) is None:
         return None
     if media_type_of(request) != URL_ENCODED:
         return None
@@ -131,7 +131,7 @@ def log_in(
     except KeyRefused as refused:
         state.rates.take(Bucket.READS, address_of(request))
         return _form(request, state, next_address, error=of_error(refused.code, refused.message))
-    state.rates.take(Bucket.SUBMISSIONS, row.id)
+    state.rates.take(Bucket.SUBMISSIONS, row.owner)
     _close(request, state)
     state.catalogue.sessions.sweep()
     lasts_s = state.settings.session_days * DAY_S
@@ -176,7 +176,7 @@ def _form(request: Request, state: State, next_address: str, *, note: str = "", 
 
 def _session(request: Request, state: State) -> tuple[bool, str]:
     """Whether the browser has an open session, and the note about it for the login page (empty without a cookie)."""
-    token = request.cookies.get(cookie_name(request))
+    token = session_token(request)
     if token is None or not state.access.keys:
         return False, ""
     try:
@@ -191,14 +191,14 @@ def _session(request: Request, state: State) -> tuple[bool, str]:
 
 
 def _close(request: Request, state: State) -> None:
-    token = request.cookies.get(cookie_name(request))
+    token = session_token(request)
     if token is not None:
         state.catalogue.sessions.close(token)
 
 
 def _set_cookie(request: Request, answer: Response, token: str, lasts_s: int) -> None:
     answer.set_cookie(
-        cookie_name(request),
+        cookie_name(request.url.scheme),
         token,
         max_age=lasts_s,
         path="/",

@@ -169,7 +169,7 @@ def products(
 async def core(psf_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
     """A picture of the core of the PSF."""
     row = await run_in_threadpool(state.row, PsfRow, psf_id, caller.owner)
-    return await picture_of(request, state, row.file_sha256, core_px=CORE_PX)
+    return await picture_of(request, state, caller.owner, row.file_sha256, core_px=CORE_PX)
 
 
 @router.post("/{psf_id}/status")

@@ -41,6 +41,7 @@ TITLES = {
     415: "The service cannot read this file",
     421: "This host name is not served",
     429: "Too many requests",
+    431: "The cookies of this site are too long",
     503: "The service cannot answer now",
     507: "The disk of the service is full",
 }

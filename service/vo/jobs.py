@@ -9,6 +9,7 @@ one runs. Destroying a job does not delete its result. Errors are plain text.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Annotated, Any
 
 import anyio
@@ -23,9 +24,8 @@ from service.http.problems import Problem, problem
 from service.http.state import Shared, State
 from service.views import time_left_s
 from service.vo import job_documents as documents
-from service.vo.job_forms import SentForm, check, files_of, ids_of, keep, kind_of, resolved
+from service.vo.job_forms import Sent, SentForm, check, files_of, ids_of, keep, kind_of, resolved
 from service.vo.parameters import (
-    NO_XML,
     PLAIN_ERRORS,
     Form,
     PlainErrors,
@@ -135,14 +135,26 @@ def list_uws_jobs(request: Request, caller: Reading, state: Shared) -> Response:
         UPLOAD=UPLOADS,
     ),
 )
-def create_uws_job(caller: Submitting, sent: SentForm, request: Request, state: Shared) -> Response:
+async def create_uws_job(caller: Submitting, sent: SentForm, request: Request, state: Shared) -> Response:
     """Create a job. All other fields are parameters of the job; write objects as JSON."""
+    return await _in_turn(_create, caller, sent, request, state)
+
+
+async def _in_turn(work: Callable[..., Response], caller: Caller, sent: Sent, *about: Any) -> Response:
+    """What ``work`` answers to a form. If the form has files, they are inspected when it is the turn of the owner."""
+    *_, state = about
+    if sent.parts:
+        return await state.pixels.run(caller.owner, work, caller, sent, *about)
+    return await run_in_threadpool(work, caller, sent, *about)
+
+
+def _create(caller: Caller, sent: Sent, request: Request, state: State) -> Response:
     form = dict(sent.fields)
     run_id, start = form.pop("runid", None), form.pop("phase", None)
     duration, destruction = form.pop("executionduration", None), form.pop("destruction", None)
     kind = kind_of(form)
-    if run_id is not None and (NO_XML.search(run_id) or len(run_id) > MAX_RUN_ID):
-        raise bad(f"expected RUNID of at most {MAX_RUN_ID} characters that XML can hold; got {run_id[:40]!a}")
+    if run_id is not None and (not run_id.isprintable() or len(run_id) > MAX_RUN_ID):
+        raise bad(f"expected RUNID of at most {MAX_RUN_ID} printable characters; got {run_id[:40]!a}")
     if start not in (None, "RUN"):
         raise bad(f"expected PHASE=RUN or no PHASE; got {start[:40]!a}")
     files = files_of(sent, kind)
@@ -286,10 +298,14 @@ def get_uws_parameters(row: Job) -> Response:
     summary="UWS: change a pending job's parameters",
     **_form(files=True, UPLOAD=UPLOADS),
 )
-def post_uws_parameters(
+async def post_uws_parameters(
     job_id: str, caller: Submitting, sent: SentForm, request: Request, state: Shared
 ) -> Response:
     """Set parameters of a PENDING job. Parameters that are not sent do not change."""
+    return await _in_turn(_amend, caller, sent, job_id, request, state)
+
+
+def _amend(caller: Caller, sent: Sent, job_id: str, request: Request, state: State) -> Response:
     row, form = _find(job_id, caller, state), dict(sent.fields)
     if row.phase != Phase.PENDING:
         raise _not_now(row, PENDING_ONLY)

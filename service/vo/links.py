@@ -16,7 +16,6 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, BinaryIO, Literal
 
-import anyio.to_thread
 from fastapi import APIRouter, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import StreamingResponse
@@ -240,9 +239,7 @@ async def get_region(request: Request, caller: Reading, state: Shared, fields: F
     if (same := files.not_modified(request, headers)) is not None:
         return same
     with as_problems():
-        file = await anyio.to_thread.run_sync(
-            _written, state, row, shape, numbers, frame, limiter=state.cutouts
-        )
+        file = await state.pixels.run(caller.owner, _written, state, row, shape, numbers, frame)
     headers["Content-Disposition"] = f'attachment; filename="product-{row.id[:12]}-cutout.fits"'
     headers["Content-Length"] = str(file.seek(0, io.SEEK_END))
     return StreamingResponse(_pieces(file), media_type=files.FITS_TYPE, headers=headers)

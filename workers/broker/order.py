@@ -12,6 +12,8 @@ import base64
 import fcntl
 import json
 import logging
+import os
+import stat
 import time
 import uuid
 from collections.abc import Callable
@@ -98,10 +100,13 @@ def _sift(response: list[bytes] | None) -> tuple[bytes, str] | None:
 
 
 class _FolderChannel(filesystem.Channel):
-    """Writes files atomically. Kombu's own channel would hang if a file is empty or incompletely written."""
+    """Writes files atomically and reads plain files only. Kombu's own channel would hang if a file is empty, incompletely
+    written or a named pipe."""
 
     def get_table(self, exchange: str) -> list[Any]:
-        """The queues bound to an exchange; empty if the file is damaged, for example by a power failure."""
+        """The queues bound to an exchange; empty if the file is damaged, for example by a power failure, or no plain file."""
+        if not self._exchange_file(exchange).is_file():
+            return []
         try:
             return list(super().get_table(exchange))
         except (TypeError, ValueError):
@@ -109,7 +114,8 @@ class _FolderChannel(filesystem.Channel):
 
     def _queue_bind(self, exchange: str, routing_key: str, pattern: str, queue: str) -> None:
         self.control_folder.mkdir(exist_ok=True)
-        with (self.control_folder / "lock").open("w") as held:
+        # For reading too: a named pipe would otherwise wait for a reader.
+        with (self.control_folder / "lock").open("ab+", buffering=0) as held:
             fcntl.flock(held, fcntl.LOCK_EX)
             binding = filesystem.exchange_queue_t(routing_key or "", pattern or "", queue or "")
             bound = self.get_table(exchange)
@@ -121,13 +127,34 @@ class _FolderChannel(filesystem.Channel):
         _write_whole(Path(self.data_folder_out) / name, payload)
 
     def _get(self, queue: str, timeout: float | None = None) -> dict[str, Any]:
-        while True:
-            message = _take(partial(super()._get, queue))
-            if message is not None:
-                return message
+        folder = Path(self.data_folder_in)
+        for name in sorted(os.listdir(folder)):
+            if name.partition(".")[2] == f"{queue}.msg":
+                content = _taken(folder / name)
+                message = None if content is None else _take(partial(json.loads, content))
+                if message is not None:
+                    return message
+        raise Empty
 
     def _reset_cycle(self) -> None:
         self._cycle = _InOrder(self._get_and_deliver, self._active_queues, Empty)
+
+
+def _taken(file: Path) -> bytes | None:
+    """The content of a message, which is removed; None if another worker took it, or if it is no plain file.
+
+    A named pipe is opened without waiting for a writer, because it would hold the worker for ever.
+    """
+    try:
+        opened = os.open(file, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW)
+        with os.fdopen(opened, "rb") as stream:
+            if not stat.S_ISREG(os.fstat(opened).st_mode):
+                return None
+            content = stream.read()
+        file.unlink()  # only one worker can
+    except OSError:
+        return None
+    return content
 
 
 def _write_whole(file: Path, content: Any) -> None:

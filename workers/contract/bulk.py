@@ -28,7 +28,8 @@ from pydantic import (
 )
 
 from psfcore.errors import DataError
-from workers.contract.requests import PRINTABLE, PRINTABLE_OR_EMPTY, Identity, Treatment
+from workers.contract.requests import Identity, Treatment
+from workers.texts import Line, Name
 
 MOST_UPLOADED = 100_000
 MOST_SETS = 100
@@ -98,10 +99,9 @@ Where = Annotated[dict[Keyword, Condition], Field(max_length=MOST_CONDITIONS)]
 class FileSet(_Strict):
     """A set of files, below a folder that the operator allows."""
 
-    glob: str = Field(
+    glob: Name = Field(
         min_length=2,
         max_length=1000,
-        pattern=PRINTABLE,
         description="an absolute path; * ? [ab] match parts of a name, ** matches any number of folders",
     )
     where: Where = Field(
@@ -113,10 +113,9 @@ class FileSet(_Strict):
 class Output(_Strict):
     """A folder that products are also written to."""
 
-    folder: str = Field(
+    folder: Name = Field(
         min_length=2,
         max_length=1000,
-        pattern=PRINTABLE,
         description="absolute path below a folder that the operator allows; the folder is created if it does not exist",
     )
     only: bool = Field(False, description="true: write products only to the folder; the service keeps none")
@@ -138,7 +137,7 @@ class Output(_Strict):
 class BulkWork(_Strict):
     """The part of a request for a bulk run that is stored with the run: all except the ids of uploaded images."""
 
-    name: str = Field("", max_length=80, pattern=PRINTABLE_OR_EMPTY, description="a name to show in lists")
+    name: Line = Field("", max_length=80, description="a name to show in lists")
     files: list[FileSet] = Field(default_factory=list, max_length=MOST_SETS)
     psf_id: Identity | None = Field(None, description="a PSF of the catalogue")
     context: str | None = Field(

@@ -29,9 +29,6 @@ from workers.versions import TIME, iso, seconds
 if TYPE_CHECKING:
     from psfcore.deconvolve.work import Options
 
-# Texts of one line from outside: without control characters, of which PostgreSQL cannot store NUL.
-PRINTABLE, PRINTABLE_OR_EMPTY = r"^[^\x00-\x1f\x7f]+$", r"^[^\x00-\x1f\x7f]*$"
-
 
 @dataclass(frozen=True)
 class Option:

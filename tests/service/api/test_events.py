@@ -3,9 +3,11 @@ stream, what each look tells, and the stream over HTTP."""
 
 from __future__ import annotations
 
+import asyncio
 import json
 import time
 from collections.abc import Iterator
+from functools import partial
 from itertools import groupby
 from typing import Any
 
@@ -17,12 +19,14 @@ from sqlalchemy import Engine, event, update
 from sqlalchemy.exc import OperationalError
 
 from service.api import events
-from service.api.events import Watch
 from service.client.http import ServiceError
+from service.http import lookout
+from service.http.callers import Caller
+from service.http.lookout import Follower, OwnerFollower, RowFollower, Watch
 from service.views import JobView
 from tests.service.conftest import execute, refusal
 from tests.service.keyed import bearer, keyed
-from tests.service.serving import Following, Live, running
+from tests.service.serving import Following, Live, in_own_loop, running
 from tests.whole.stack import wait_for
 from workers.catalogue import followed
 from workers.catalogue.bulks import new_id
@@ -33,10 +37,12 @@ from workers.catalogue.tables import DEFAULT_OWNER, BulkRow, JobRow, KeyRow
 from workers.contract.bulk import BulkPhase
 from workers.settings import Settings
 
+CALLER = Caller(DEFAULT_OWNER, frozenset(), "key", DEFAULT_OWNER)
+
 
 @pytest.fixture
 def live(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> Iterator[Live]:
-    monkeypatch.setattr(events, "LOOK_EVERY_S", 0.05)
+    monkeypatch.setattr(lookout, "LOOK_EVERY_S", 0.05)
     with running(settings.model_copy(update={"streams_per_caller": 2})) as server:
         yield server
 
@@ -97,23 +103,25 @@ def test_a_job_that_is_destroyed_and_a_server_that_stops_end_their_streams(live:
 
 
 def test_a_stream_ends_with_its_key(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(events, "LOOK_EVERY_S", 0.02)
+    monkeypatch.setattr(lookout, "LOOK_EVERY_S", 0.02)
     with keyed(settings, stream_s=10.0) as service:  # guards against a hang
         for how, change in (("revoked", {"revoked_at": 1.0}), ("expired", {"expires_at": 1.0})):
             key = service.key("ann")
             job, _ = service.catalogue.jobs.submit("psf-build", {}, how, "ann")
             end = update(KeyRow).where(KeyRow.id == key.split("_")[1]).values(**change)
-            get, looks = service.catalogue.jobs.get, []
+            read, looks = service.catalogue.followed_jobs.named, []
 
-            def look(job_id: str, get: Any = get, looks: list[str] = looks, end: Any = end) -> JobRow | None:
-                looks.append(job_id)
+            def look(
+                ids: Any, read: Any = read, looks: list[str] = looks, end: Any = end
+            ) -> dict[str, JobRow]:
+                looks.append(ids)
                 if len(looks) == 5:  # the stream is open and has sent an event
                     execute(service.catalogue, end)
-                row: JobRow | None = get(job_id)
-                return row
+                rows: dict[str, JobRow] = read(ids)
+                return rows
 
             with monkeypatch.context() as patched:
-                patched.setattr(service.catalogue.jobs, "get", look)
+                patched.setattr(service.catalogue.followed_jobs, "named", look)
                 said = service.api.get(f"/v1/jobs/{job.id}/events", headers=bearer(key))
             assert said.status_code == 200 and len(looks) == 5
             assert said.text.count("event: progress") == 1 and "event: end" not in said.text
@@ -149,7 +157,7 @@ class Looks:
 
     def __init__(self, catalogue: Catalogue, *named: str, since: float | None = None) -> None:
         rows = catalogue.followed_jobs
-        since = rows.now() - events.OVERLAP_S if since is None else since
+        since = rows.now() - lookout.OVERLAP_S if since is None else since
         self.watch = Watch("job", rows, JobView.of, DEFAULT_OWNER, frozenset(named), Place(since))
 
     def told(self) -> list[tuple[str, dict[str, Any]]]:
@@ -165,7 +173,7 @@ class BulkLooks(Looks):
 
     def __init__(self, catalogue: Catalogue, *named: str) -> None:
         rows = catalogue.followed_bulks
-        since = Place(rows.now() - events.OVERLAP_S)
+        since = Place(rows.now() - lookout.OVERLAP_S)
         self.watch = Watch("bulk", rows, Line.of, DEFAULT_OWNER, frozenset(named), since, after_end=2)
 
 
@@ -240,7 +248,7 @@ def test_ends_that_no_look_saw_coming_are_told_once(catalogue: Catalogue) -> Non
 def test_a_bulk_run_that_ended_some_time_ago_is_followed_until_it_is_deleted(
     catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(events, "OVERLAP_S", 0.0)
+    monkeypatch.setattr(lookout, "OVERLAP_S", 0.0)
     runs = [bulk_run(catalogue) for _ in range(3)]
     before = bulk_run(catalogue)
     catalogue.bulks.cancel(before)
@@ -272,7 +280,7 @@ def test_other_owners_and_turns_of_bulk_runs_are_not_told(catalogue: Catalogue) 
 def test_ends_since_a_time_come_in_pages_that_lose_none(
     catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (followed, events):
+    for module in (followed, lookout):
         monkeypatch.setattr(module, "MOST", 3)
     ids = [submitted(catalogue) for _ in range(10)]
     at = time.time() - 3600.0
@@ -289,7 +297,7 @@ def test_ends_since_a_time_come_in_pages_that_lose_none(
 def test_of_very_many_waiting_jobs_the_newest_are_told_and_every_end(
     catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (followed, events):
+    for module in (followed, lookout):
         monkeypatch.setattr(module, "MOST", 3)
     ids = [submitted(catalogue) for _ in range(5)]
     looks = Looks(catalogue)
@@ -323,6 +331,84 @@ def test_many_jobs_need_as_few_queries_as_one(catalogue: Catalogue) -> None:
     statements.clear()
     assert looks.told() == [] and len(statements) == 4
     event.remove(Engine, "before_cursor_execute", count)
+
+
+def follower_of(catalogue: Catalogue, *named: str, last_id: str | None = None) -> OwnerFollower:
+    """A stream of all jobs of the owner."""
+    watch = Watch(
+        "job", catalogue.followed_jobs, JobView.of, DEFAULT_OWNER, frozenset(named), Place(time.time() - 10.0)
+    )
+    return OwnerFollower(CALLER, [watch])
+
+
+def test_all_streams_of_an_owner_need_as_few_queries_as_one(
+    catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lookout, "LOOK_EVERY_S", 0.5)  # all looks below fall into one
+    ids = [submitted(catalogue) for _ in range(20)]
+    statements: list[str] = []
+
+    def count(_connection: Any, _cursor: Any, statement: str, *_: Any) -> None:
+        if statement.startswith("SELECT"):
+            statements.append(statement)
+
+    async def queries(many: int) -> int:
+        seen = lookout.Lookout(lambda caller: catalogue.keys.is_good(caller.name) or True)
+        followers: list[Follower] = [follower_of(catalogue) for _ in range(many)]
+        followers += [
+            RowFollower(CALLER, catalogue.followed_jobs, one, JobView.of, None) for one in ids[:many]
+        ]
+        assert all([(await seen.next(one))[0] for one in followers])
+        statements.clear()
+        assert {await seen.next(one) for one in followers} == {("", False)}
+        return len(statements)
+
+    event.listen(Engine, "before_cursor_execute", count)
+    try:
+        assert [in_own_loop(partial(queries, many)) for many in (1, 20)] == [
+            6,
+            6,
+        ]  # key, rows, and those of a watch
+    finally:
+        event.remove(Engine, "before_cursor_execute", count)
+
+
+def test_a_stream_that_comes_later_knows_all_and_takes_nothing_from_the_others(
+    catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lookout, "LOOK_EVERY_S", 0.05)
+    long_ago = submitted(catalogue)
+    ended_long_ago(catalogue, long_ago)
+
+    async def follow() -> None:
+        seen, first = lookout.Lookout(lambda _: True), follower_of(catalogue)
+
+        async def until(follower: Follower, *expected: str) -> list[tuple[str, str]]:
+            """The events for jobs, up to one that contains these texts."""
+            told = ""
+            while not all(text in told for text in expected):
+                told += (await seen.next(follower))[0]
+            events = [_parsed(block) for block in told.split("\n\n") if "event: " in block]
+            return [(data["id"], data.get("phase", name)) for name, data in events]
+
+        await until(first, "id: ")
+        fresh = submitted(catalogue)
+        later = follower_of(catalogue, long_ago)
+        told = await until(later, "id: ")
+        assert told == [(long_ago, "COMPLETED"), (fresh, "QUEUED")]
+        assert await until(first, fresh) == [(fresh, "QUEUED")], "its end was not known to the first"
+        catalogue.uws.destroy(long_ago)
+        assert (long_ago, "gone") in await until(later, "gone")
+        catalogue.jobs.complete(claimed(catalogue, fresh), "r" * 64)
+        for one in (first, later):
+            assert (fresh, "COMPLETED") in await until(one, "COMPLETED")
+        for _ in range(lookout.MOST_UNREAD + 2):
+            fresh = submitted(catalogue)
+            await until(later, fresh)
+        last = await seen.next(first)
+        assert last == ("", True), "who does not read is ended and asks again from its last id"
+
+    in_own_loop(lambda: asyncio.wait_for(follow(), 60))
 
 
 def test_a_look_that_fails_loses_nothing(catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:

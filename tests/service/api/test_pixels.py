@@ -153,5 +153,4 @@ def test_clients_at_once_get_the_same_pixels_of_one_decoding(
             np.testing.assert_array_equal(numbers(answer), stored)
     assert decodings == ["image"]
     state: State = api.app.state.heliopsf
-    assert state.decoding.borrowed_tokens == 0
     assert list((state.settings.data_dir / "tmp").iterdir()) == []

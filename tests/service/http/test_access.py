@@ -215,7 +215,11 @@ def test_keys_are_made_listed_and_revoked_by_command(run: Callable[..., Result],
     assert "revoked" in run("key", "list").stdout
     unknown = run("key", "revoke", "0" * 16)
     assert unknown.exit_code == 1 and "no key" in unknown.output
-    for wrong in (("--owner", "A B"), ("--owner", "a", "--expires", "soon")):
+    for wrong in (
+        ("--owner", "A B"),
+        ("--owner", "a", "--expires", "soon"),
+        ("--owner", "a", "--label", "\u202e"),
+    ):
         assert run("key", "create", *wrong).exit_code == 2
 
 

@@ -19,12 +19,14 @@ from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
+from starlette import requests
 
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.header import HeaderSummary
 from service import server
 from service.app import create_app
 from service.http import files as http_files
+from service.http.guard import SESSION_COOKIE
 from tests.conftest import write_image
 from tests.service.conftest import refusal, settings_in
 from tests.service.keyed import Keyed, bearer, keyed
@@ -98,6 +100,42 @@ def test_without_a_key_or_its_scope_no_body_is_awaited(live: Live) -> None:
         headers = JSON | {"Content-Length": "1000"} | key
         with live.begin(method, path, headers, b"[[],[],") as connection:
             assert connection.recv(100).startswith(f"HTTP/1.1 {status}".encode()), (method, path, key)
+
+
+# Heads ----------------------------------------------------------------------------------------------
+
+
+def test_only_the_own_cookie_is_parsed_and_long_cookies_are_refused_before_the_key(
+    live: Live, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Python's parser of cookies took seconds for 60 kB of backslashes (CVE-2024-7592)."""
+    parsed: list[str] = []
+    parser = requests.cookie_parser
+    monkeypatch.setattr(requests, "cookie_parser", lambda text: parsed.append(text) or parser(text))
+    foreign, own = 'other="' + 1000 * r"\"\\" + '"', f"{SESSION_COOKIE}=no-session_1"
+    for cookies, status, kept in (
+        (foreign, 401, []),
+        (f"{foreign}; {own}; x=y", 401, [own]),
+        (f"x{own}; {own}\tx", 401, []),
+        (f'{SESSION_COOKIE}="a\\"', 401, []),
+        (foreign + 100 * "a", 431, []),
+    ):
+        parsed.clear()
+        with live.begin("GET", "/v1/jobs", {"Cookie": cookies}) as connection:
+            answer = live.answer(connection)
+        assert answer.startswith(f"HTTP/1.1 {status}".encode()), (cookies[-80:], answer)
+        assert set(parsed) <= {own} and list(dict.fromkeys(parsed)) == kept, cookies[-80:]
+    assert b"cookies-too-long" in answer
+
+
+def test_a_body_with_two_lengths_is_refused_and_its_connection_closed(live: Live) -> None:
+    """A proxy that goes by the other length would read the request at its end as one of another client."""
+    both = JSON | {"Content-Length": "5", "Transfer-Encoding": "chunked"} | bearer(live.service.key("ann"))
+    hidden = b"0\r\n\r\nGET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    with live.begin("POST", "/v1/jobs", both, hidden) as connection:
+        answer = live.answer(connection)
+        assert answer.startswith(b"HTTP/1.1 400") and b"two-body-lengths" in answer
+        assert connection.recv(100) == b"", "the connection is closed"
 
 
 # Sizes ----------------------------------------------------------------------------------------------
@@ -212,8 +250,9 @@ def test_a_caller_holds_only_so_many_requests(settings: Settings) -> None:
     with keyed(settings, requests_per_caller=2) as service:
         ann, bob = service.client("ann"), service.client("bob")
         held = service.api.app.state.heliopsf.requests
-        who = ann.headers["Authorization"].split("_")[1]
+        who = "ann"  # all keys of an owner count together
         held.open(who), held.open(who)
+        refusal(service.client("ann").get("/v1/jobs"), 429, "too-many-requests-at-once")
         refusal(ann.get("/v1/jobs"), 429, "too-many-requests-at-once")
         assert bob.get("/v1/jobs").status_code == 200
         held.close(who)

@@ -122,6 +122,23 @@ def test_a_text_that_no_database_holds_is_refused_wherever_it_stands(shared_api:
         refusal(shared_api.request(method, address, headers=headers, **sent), 422, "invalid-request")
 
 
+def test_a_name_that_looks_like_another_one_is_refused_wherever_it_is_given(shared_service: Keyed) -> None:
+    """A mark of the direction of writing, or a control character of C1."""
+    ann, image_id = shared_service.client("ann"), 64 * "a"
+    run = {"images": [image_id], "psf_id": image_id}
+    for sign in ("\u202e", "\x9b"):
+        for address, sent in (
+            ("/v1/keys", {"json": {"label": sign, "scopes": ["read"]}}),
+            ("/v1/bulk", {"json": run | {"name": sign}}),
+            ("/v1/psfs", {"params": {"name": sign}, "content": b"SIMPLE  ="}),
+            ("/v1/psfs", {"params": {"version": sign}, "content": b"SIMPLE  ="}),
+            ("/v1/contexts", {"json": {"name": "c", "reason": sign}}),
+        ):
+            assert "printable" in refusal(ann.post(address, **sent), 422, "invalid-request"), address
+        uws = ann.post("/uws/jobs", data={"KIND": "psf-build", "instrument": "hri_euv", "RUNID": sign})
+        assert uws.status_code == 400 and "RUNID" in uws.text
+
+
 # Rates ----------------------------------------------------------------------------------------------
 
 
@@ -134,12 +151,13 @@ def test_each_caller_has_rates_of_its_own(settings: Settings) -> None:
             assert answer.status_code == 200
             assert re.fullmatch(rf'"reads";r={left};t=\d+', answer.headers["RateLimit"])
             assert answer.headers["RateLimit-Policy"] == '"reads";q=5;w=60'
+        assert service.client("ann").get("/v1/jobs").status_code == 429, "another key of the same owner"
         refused = ann.get("/v1/jobs")
         assert "5 requests" in refusal(refused, 429, "too-many-requests")
         assert 1 <= int(refused.headers["Retry-After"]) <= 60
         uws = ann.get("/uws/jobs")
         assert uws.status_code == 429 and "Retry-After" in uws.headers
-        assert bob.get("/v1/jobs").status_code == 200, "another key"
+        assert bob.get("/v1/jobs").status_code == 200, "another owner"
         assert ann.get("/healthz").status_code == 200, "no rate limits"
         assert [ann.post("/v1/jobs", json={}).status_code for _ in range(4)] == [422, 422, 422, 429]
         statuses = [service.api.get("/v1/jobs", headers=bearer(f"x{n}")).status_code for n in range(7)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import fcntl
 import json
+import os
 import signal
 import threading
 import time
@@ -179,6 +180,33 @@ def test_what_was_cut_in_the_folder_when_the_power_went_stops_nobody(settings: S
         (broker / "queue" / f"1_x.{broker_name(Queue.BULK)}.msg.ab.part").write_text("")
         assert queue.submit(queue.make_app(settings), second, Queue.BULK)
         assert take() == [second]
+
+
+def test_a_named_pipe_in_the_folder_holds_no_worker(settings: Settings) -> None:
+    app, name = queue.make_app(settings), broker_name(Queue.BULK)
+    broker, job = settings.data_dir / "broker", uuid.uuid4().hex
+    for path in (
+        broker / "queue" / f"0_x.{name}.msg",
+        broker / "control" / f"{name}.exchange",
+        broker / "control" / "lock",
+    ):
+        os.mkfifo(path)
+    (broker / "queue" / f"1_x.{name}.msg").symlink_to(__file__)
+    FolderTransport.global_state.clear()
+    pools.reset()
+    taken: list[str] = []
+
+    def work() -> None:
+        assert queue.submit(app, job, Queue.BULK)
+        with app.connection_for_read() as connection:
+            channel = connection.default_channel
+            channel.basic_consume(name, True, lambda message: taken.append(message.payload[0][0]), "tag")
+            channel.drain_events(timeout=1)
+
+    working = threading.Thread(target=work, daemon=True)
+    working.start()
+    working.join(10.0)
+    assert taken == [job]
 
 
 def test_a_process_that_binds_a_queue_waits_for_another_that_does(settings: Settings) -> None:
