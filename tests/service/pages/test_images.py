@@ -56,7 +56,11 @@ def checked(api: TestClient, image_id: str, **options: str) -> list[str]:
 def test_an_image_without_a_psf_is_told_so(api: TestClient, tmp_path: Path) -> None:
     xrt = image(api, tmp_path, **XRT)
     (line,) = checked(api, xrt)
-    assert line.startswith("No PSF for Hinode/XRT is known here.") and "Upload a PSF here" in line
+    assert (
+        line.startswith("No PSF for Hinode/XRT is known here: ")
+        and "mirrors" in line
+        and "Upload a PSF here" in line
+    )
     page = api.get(f"/images/{xrt}").text
     assert "none: choose a PSF" in page and "chosen for this image" not in page
     assert "2012-06-05T22:00:00.123" in page
