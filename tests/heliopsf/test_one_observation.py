@@ -218,19 +218,18 @@ def all_warnings(image: Image) -> dict[str, str]:
     return dict(image.warnings) | ({} if of_level is None else {"saturation": of_level})
 
 
-@pytest.fixture(scope="module")
-def psf_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def write_psf(path: Path) -> Path:
     at = np.arange(33) - 16
     r2 = at[:, None] ** 2 + at[None] ** 2
-    kernel = (
-        0.9 * np.exp(-r2 / 1.5) / np.exp(-r2 / 1.5).sum()
-        + 0.1 * (1 + r2 / 25) ** -1.5 / ((1 + r2 / 25) ** -1.5).sum()
-    )
-    path = tmp_path_factory.mktemp("psf") / "psf.fits"
-    fits.PrimaryHDU(
-        kernel, fits.Header({"CDELT1": 0.6, "CDELT2": 0.6, "CUNIT1": "arcsec", "CUNIT2": "arcsec"})
-    ).writeto(path)
+    core, halo = np.exp(-r2 / 1.5), (1 + r2 / 25) ** -1.5
+    cards = fits.Header({"CDELT1": 0.6, "CDELT2": 0.6, "CUNIT1": "arcsec", "CUNIT2": "arcsec"})
+    fits.PrimaryHDU(0.9 * core / core.sum() + 0.1 * halo / halo.sum(), cards).writeto(path)
     return path
+
+
+@pytest.fixture(scope="module")
+def psf_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_psf(tmp_path_factory.mktemp("psf") / "psf.fits")
 
 
 def deconvolved(image: Any, psf_file: Path) -> Deconvolution:
