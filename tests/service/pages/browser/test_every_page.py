@@ -103,7 +103,8 @@ def test_the_page_of_a_name_that_is_not_served_is_good(browser: Browser, open_st
 def test_the_report_of_a_gap_is_good(page: Page, site: Site) -> None:
     report = keep_gap_report(settings_of(site.data), site.owner)
     page.goto(f"/reports/{GAP_ID}")
-    expect(page.locator("main")).to_contain_text(report["sentence"][2:16])  # the page begins with "WHERE: a gap of"
+    # The page begins with "WHERE: a gap of".
+    expect(page.locator("main")).to_contain_text(report["sentence"][2:16])
     good(page)
 
 
