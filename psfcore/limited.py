@@ -80,10 +80,9 @@ def run_limited(
 
     function: a function of a module that reads the file ``path``. target: an open file, to which it may write. arguments,
     answer: values that JSON can hold. pixels: the number of pixels of the file, which limits the memory of the child. seconds: the
-    limit of its processor time. Raises
-    the DataError, HeaderError or OSError of the function; DataError "unreadable-pixels" if the child crashed, or needed more
-    memory or processor time than its pixels explain; OSError if the child was ended from outside again and again, or gave no answer
-    in PATIENCE_S.
+    limit of its processor time. Raises the DataError, HeaderError or OSError of the function; DataError "unreadable-pixels" if the
+    child crashed, or needed more memory or processor time than its pixels explain; OSError if the child was ended from outside again
+    and again, or gave no answer in PATIENCE_S.
     """
     path = Path(path).absolute()
     if _is_child:
@@ -245,9 +244,8 @@ def _serve() -> None:
     os.set_blocking(wake, False)
     signal.signal(signal.SIGCHLD, lambda _signal, _frame: None)
     signal.set_wakeup_fd(wake)
-    children: dict[
-        int, tuple[int, float]
-    ] = {}  # for each process its connection, and when it must have ended
+    # For each process its connection, and when it must have ended.
+    children: dict[int, tuple[int, float]] = {}
     with socket.socket(fileno=0) as owner, selectors.DefaultSelector() as ready:
         ready.register(owner, selectors.EVENT_READ)
         ready.register(woken, selectors.EVENT_READ)

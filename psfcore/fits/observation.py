@@ -63,9 +63,8 @@ def observation_of_hdus(
     chosen: `number`, if the caller named it. Raises the errors of `observation_of`.
     """
     hdu = hdus[number]
-    header = (
-        hdu.header.copy()
-    )  # before its pixels are read: astropy then removes the cards that tell lost pixels
+    # Before its pixels are read: astropy then removes the cards that tell lost pixels.
+    header = hdu.header.copy()
     damaged = "data" not in vars(hdu) and hdu.verify_datasum() == 0
     pixels = np.asarray(hdu.data)
     others = [
@@ -95,8 +94,8 @@ def _with_planes(
     for number, name, shape in stored.others:
         if name.upper() not in (*FLAGS, *ERRORS):
             others.append(f"{number} ({name})" if name else str(number))
-        elif is_image and shape == stored.pixels.shape:
-            planes.setdefault(name.upper(), read(number))  # further ones belong to further images
+        elif is_image and shape == stored.pixels.shape and name.upper() not in planes:
+            planes[name.upper()] = read(number)  # further ones belong to further images
     image = observation_of(
         stored.pixels, stored.header, bits=stored.bits, planes=planes, saturation_dn=saturation_dn
     )

@@ -155,8 +155,8 @@ def _counted(image: Image, level: Saturation) -> Saturation:
     if counted is None or level.found is None:
         return level
     card = next(key for key in _COUNTS if optional_number(image.header, key) is not None)
-    values = image.pixels[image.finite]
     if level.level is None:
+        values = image.pixels[image.finite]
         if not 0 < counted <= LARGEST_COUNTED * values.size:
             return level if counted else replace(level, warning=None)
         next_one, brightest = np.partition(values, (-counted - 1, -counted))[[-counted - 1, -counted]]
@@ -169,8 +169,9 @@ def _counted(image: Image, level: Saturation) -> Saturation:
             card,
             f"{level.warning}. {card} counts {counted} saturated pixels, so the {counted} brightest are masked",
         )
-    above = int(np.count_nonzero(values > level.level))
+    above = int(np.count_nonzero((image.pixels > level.level) & image.finite))
     if above > COUNT_ERROR * counted:
+        values = image.pixels[image.finite]
         return Saturation(
             float(np.partition(values, -counted)[-counted]) if counted else None,
             card,

@@ -53,22 +53,22 @@ def unusable_pixels(
     lost = _lost(pixels, header, bits)
     if lost is not None:
         mask[lost] = int(MaskBit.LOST | MaskBit.NONFINITE)
-        pixels = np.where(lost, np.nan, pixels)
         count = int(np.count_nonzero(lost))
         stated = int(max(optional_number(header, key) or 0 for key in ("NMISSING", "MISSVALS")))
         warnings["lost"] = (
             f"{count} pixels were lost on the way to the ground; they are not used, and QUALITY marks them"
             + (f" (the header counts {stated})" if stated not in (0, count) else "")
         )
+    valid = mask == 0
     for code, where, words in (
         (
             "wrapped",
-            _wrapped(pixels, mask == 0, header, bits),
+            _wrapped(pixels, valid, header, bits),
             "are negative because counts above 32767 were written as 16 bits",
         ),
         (
             "zeros",
-            _blocks_of_zeros(pixels),
+            _blocks_of_zeros(pixels, valid),
             "of blocks of exactly 0 count as lost, as after an interrupted download",
         ),
     ):
@@ -132,12 +132,12 @@ def _wrapped(pixels: Pixels, valid: Where, header: Cards, bits: int | None) -> W
     return negative & (pixels <= values[far[-1]]) if far.size else None
 
 
-def _blocks_of_zeros(pixels: Pixels) -> Where | None:
+def _blocks_of_zeros(pixels: Pixels, valid: Where) -> Where | None:
     """Pixels [y, x] of blocks of zeros that are no measurement; None if there are none."""
-    zero = pixels == 0
+    zero = (pixels == 0) & valid
     if np.count_nonzero(zero) < BLOCK_PX**2:
         return None
-    cut = _rows_of_zeros(pixels, zero)
+    cut = _rows_of_zeros(zero)
     if cut is not None:
         return cut
     from scipy import ndimage
@@ -151,16 +151,16 @@ def _blocks_of_zeros(pixels: Pixels) -> Where | None:
     )
     near = ndimage.binary_dilation(blocks[box], np.ones((2 * BESIDE_PX + 1, 1), np.bool_))
     near = ndimage.binary_dilation(near, np.ones((1, 2 * BESIDE_PX + 1), np.bool_))
-    beside = pixels[box][near & ~blocks[box] & np.isfinite(pixels[box])]
+    beside = pixels[box][near & ~blocks[box] & valid[box]]
     if beside.size < BLOCK_PX * BESIDE_PX or np.count_nonzero(beside == 0) > ZEROS_BESIDE * beside.size:
         return None
     dark, middle = np.percentile(beside, (5, 50))
     return blocks if dark > DARKEST_BESIDE * middle > 0 else None
 
 
-def _rows_of_zeros(pixels: Pixels, zero: Where) -> Where | None:
+def _rows_of_zeros(zero: Where) -> Where | None:
     """The rows of nothing but 0 at the bottom and the top, if the rows beside them are mostly not 0; None if there are none."""
-    some, found = np.flatnonzero(~zero.all(axis=1)), np.zeros(pixels.shape, np.bool_)
+    some, found = np.flatnonzero(~zero.all(axis=1)), np.zeros(zero.shape, np.bool_)
     if not some.size:
         return None
     first, last = int(some[0]), int(some[-1])

@@ -9,8 +9,10 @@ from __future__ import annotations
 import errno
 import gzip
 import stat
+import struct
 import tarfile
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -40,6 +42,20 @@ _STARTS: tuple[tuple[Literal["zip", "tar", "gzip"], int, bytes], ...] = (
 )
 _NO_PLAIN_FILE = "expected only plain files, no links, devices or sparse files"
 _ZIP_ENCRYPTED = 0x1 | 0x40 | 0x2000
+# The exceptions that a damaged archive raises, depending on where the damage is.
+_DAMAGE = (
+    zipfile.BadZipFile,
+    tarfile.TarError,
+    zlib.error,
+    struct.error,
+    EOFError,
+    OSError,
+    ValueError,
+    LookupError,
+    ArithmeticError,
+    NotImplementedError,
+    RuntimeError,
+)
 
 
 def could_be_archive(start: bytes) -> bool:
@@ -138,12 +154,12 @@ def copy_bytes(source: IO[bytes], target: IO[bytes], count: int, name: str) -> N
 
 @contextmanager
 def _damage_told() -> Iterator[None]:
-    """Make a DataError "archive-broken" of every exception that a damaged archive causes in the libraries."""
+    """Make a DataError "archive-broken" of the exceptions that a damaged archive causes in the libraries."""
     try:
         yield
     except DataError:
         raise
-    except Exception as error:
+    except _DAMAGE as error:
         if isinstance(error, OSError) and error.errno not in (None, errno.EINVAL):
             raise  # an error of the disk, not of the archive
         reason = " ".join(str(error).split()) or type(error).__name__

@@ -28,9 +28,8 @@ LOOK_EVERY_S = 0.5
 # Rows that ended up to this number of seconds before the last look are read again: they may have been committed late,
 # and the clocks of the machines that write the ends of bulk runs may differ from the clock of the database.
 OVERLAP_S = 10.0
-MOST_UNREAD = (
-    16  # texts that wait for a client; a stream whose client is slower ends, and the client connects again
-)
+# Texts that wait for a client. A stream whose client is slower ends, and the client connects again.
+MOST_UNREAD = 16
 _UNKNOWN = State("", None, ())
 
 # The next text of a stream, empty if nothing has changed; and whether the stream ends after it.
