@@ -42,7 +42,7 @@ SECONDS = 60  # of processor time; a child may take ten times as long if the mac
 LONGEST_S, PATIENCE_S = 10.0 * SECONDS, 10.0 * SECONDS + 30  # of a child, and of the wait for its answer
 TRIES = 3
 EXIT, LATE = -1, -2  # a child ended itself; the server ended it, because it took too long
-# What ends a child because of its file; SIGXCPU is the limit of its processor time.
+# What ends a child because of its file; SIGXCPU is the limit of its processor time, SIGXFSZ that of what it writes.
 _OF_FILE = (
     EXIT,
     signal.SIGSEGV,
@@ -53,6 +53,7 @@ _OF_FILE = (
     signal.SIGTRAP,
     signal.SIGSYS,
     signal.SIGXCPU,
+    signal.SIGXFSZ,
 )
 _BYTES_A_PIXEL, _MORE_BYTES = 64, 128 * MIB  # of memory, in addition to the libraries
 # The first one lets its library do what it does once, before there is a wall.
@@ -74,22 +75,29 @@ def run_limited(
     *,
     pixels: int,
     seconds: int = SECONDS,
+    answer_bytes: int | None = None,
     **arguments: Any,
 ) -> Answer:
     """Call ``function(target, path=path, **arguments)`` in a child process; returns its answer.
 
     function: a function of a module that reads the file ``path``. target: an open file, to which it may write. arguments,
     answer: values that JSON can hold. pixels: the number of pixels of the file, which limits the memory of the child. seconds: the
-    limit of its processor time. Raises the DataError, HeaderError or OSError of the function; DataError "unreadable-pixels" if the
-    child crashed, or needed more memory or processor time than its pixels explain; OSError if the child was ended from outside again
-    and again, or gave no answer in PATIENCE_S.
+    limit of its processor time. answer_bytes: the limit of what it writes to a file; default: what the pixels explain, and no
+    limit if there are none. Raises the DataError, HeaderError or OSError of the function; DataError "unreadable-pixels" if the
+    child crashed, or needed more memory or processor time, or wrote more, than its pixels explain; OSError if the child was ended
+    from outside again and again, or gave no answer in PATIENCE_S.
     """
-    path = Path(path).absolute()
+    path, file = Path(path).absolute(), os.stat(path)
+    if path.parent == Path("/dev/fd"):  # such a path has a meaning in this process alone
+        path = path.resolve()
     if _is_child:
         return function(target, path=str(path), **arguments)
+    memory_bytes = _BYTES_A_PIXEL * pixels + file.st_size + _MORE_BYTES
     request = {
         "function": f"{function.__module__}:{function.__qualname__}",
-        "memory_bytes": _BYTES_A_PIXEL * pixels + path.stat().st_size + _MORE_BYTES,
+        "file": [file.st_dev, file.st_ino],
+        "memory_bytes": memory_bytes,
+        "answer_bytes": answer_bytes or (memory_bytes if pixels else None),
         "seconds": seconds,
         "filling": FILLING,
         "arguments": {"path": str(path)} | arguments,
@@ -307,8 +315,11 @@ def _reply(request: Answer, target: int) -> Answer:
     function = getattr(importlib.import_module(module), name)
     fill_new_memory(request["filling"])
     try:
-        _limit(request["memory_bytes"], request["seconds"])
-        raise_wall([request["arguments"]["path"]])
+        _limit(request["memory_bytes"], request["answer_bytes"], request["seconds"])
+        raise_wall([path := request["arguments"]["path"]])
+        # Behind the wall this file alone can be opened: not another one that gets its name now.
+        if request["file"] != [os.stat(path).st_dev, os.stat(path).st_ino]:
+            raise OSError(errno.ESTALE, os.strerror(errno.ESTALE))
         with os.fdopen(target, "wb") as file:
             return {"answer": function(file, **request["arguments"])}
     except DataError as error:
@@ -317,14 +328,20 @@ def _reply(request: Answer, target: int) -> Answer:
     except MemoryError:
         return {"ended": signal.SIGXCPU}
     except OSError as error:
+        if error.errno == errno.EFBIG:
+            return {"ended": signal.SIGXFSZ}
         return {"errno": error.errno} if error.errno else {"fault": traceback.format_exc()}
     except Exception:  # noqa: BLE001  (the owner raises it)
         return {"fault": traceback.format_exc()}
 
 
-def _limit(memory_bytes: int, seconds: int) -> None:
-    """Limit the memory and the time of this process."""
+def _limit(memory_bytes: int, answer_bytes: int | None, seconds: int) -> None:
+    """Limit the memory, the answer and the time of this process."""
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    if answer_bytes is not None:
+        _, most = resource.getrlimit(resource.RLIMIT_FSIZE)
+        limit = answer_bytes if most == resource.RLIM_INFINITY else min(most, answer_bytes)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
     _, most = resource.getrlimit(resource.RLIMIT_CPU)
     unlimited = most == resource.RLIM_INFINITY
     soft = seconds if unlimited else min(seconds, most)

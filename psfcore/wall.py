@@ -1,15 +1,17 @@
 """A wall around a process that reads a file of strangers: a C library that such a file misuses finds nothing behind it.
 
-Two parts of Linux make the wall, and neither can be taken down again by the process:
+Three parts of Linux make the wall, and none can be taken down again by the process:
 
 - Landlock (Linux 5.13 and later): of all files the process can open those that it may read, and the folders of the libraries' code.
   Files that are open already stay open.
 - seccomp: the process cannot make sockets, start programs or processes, reach other processes, or change modes and times of files.
+- A user of its own, if the service runs as root. Of the rights of root it keeps the one to read files, because its file and the code of
+  the libraries may be readable for root alone; Landlock says which.
 
     raise_wall([path])
-    walls()     # {"files": True, "calls": True}
+    walls()     # {"files": True, "calls": True, "user": True}
 
-Sources: man pages landlock(7), seccomp(2); include/uapi/linux/landlock.h and the tables of system calls of Linux 6.12.
+Sources: man pages landlock(7), seccomp(2), capabilities(7); include/uapi/linux/landlock.h and the tables of system calls of Linux 6.12.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ import platform
 import site
 import sys
 import sysconfig
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
 
 _CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446  # system calls, the same on every machine
@@ -66,7 +68,9 @@ _MACHINES: dict[str, tuple[int, dict[str, int]]] = {
 # The numbers of clone, tgkill and prlimit64, which are allowed for threads and for the process itself, and of clone3.
 _OF_ITSELF = {"x86_64": (56, 234, 302), "aarch64": (220, 131, 261)}
 _CLONE3 = 435
-_up = {"files": False, "calls": False}
+_USER = 65534  # of the process, and its group: "nobody", who owns no file
+_KEEP_CAPABILITIES, _READ_CAPABILITY, _CAPABILITIES_VERSION = 8, 1 << 2, 0x20080522
+_up = {"files": False, "calls": False, "user": False}
 
 
 class _Ruleset(ctypes.Structure):
@@ -76,6 +80,12 @@ class _Ruleset(ctypes.Structure):
 class _Beneath(ctypes.Structure):
     _pack_ = 1
     _fields_ = (("allowed", ctypes.c_uint64), ("folder", ctypes.c_int32))
+
+
+class _Capabilities(ctypes.Structure):
+    """The header of capset(2), and after it each of its three sets in two halves."""
+
+    _fields_ = (("version", ctypes.c_uint32), ("process", ctypes.c_int32), ("sets", ctypes.c_uint32 * 6))
 
 
 class _Instruction(ctypes.Structure):
@@ -91,8 +101,8 @@ class _Program(ctypes.Structure):
     _fields_ = (("length", ctypes.c_uint16), ("first", ctypes.POINTER(_Instruction)))
 
 
-def raise_wall(files: Iterable[str | Path]) -> None:
-    """Raise the wall around this process, as far as its kernel has the parts. files: the files that it may still open to read.
+def raise_wall(files: Sequence[str | Path]) -> None:
+    """Raise the wall around this process, as far as its kernel has the parts. files: those that it may still open to read.
 
     Raises OSError if a part exists and cannot be raised, or a file cannot be opened.
     """
@@ -101,6 +111,7 @@ def raise_wall(files: Iterable[str | Path]) -> None:
     libc = ctypes.CDLL(None, use_errno=True)
     _called(libc.prctl(_SET_NO_NEW_PRIVS, 1, 0, 0, 0))
     _up["files"] = _close_files(libc, files)
+    _up["user"] = _leave_root(libc, files)
     _up["calls"] = _close_calls(libc)
 
 
@@ -117,7 +128,7 @@ def _called(result: int) -> int:
     return result
 
 
-def _close_files(libc: ctypes.CDLL, files: Iterable[str | Path]) -> bool:
+def _close_files(libc: ctypes.CDLL, files: Sequence[str | Path]) -> bool:
     version = libc.syscall(_CREATE_RULESET, None, 0, _VERSION)
     if version < 1:
         return False
@@ -130,6 +141,30 @@ def _close_files(libc: ctypes.CDLL, files: Iterable[str | Path]) -> bool:
         os.close(here)
     _called(libc.syscall(_RESTRICT_SELF, rules, 0))
     os.close(rules)
+    return True
+
+
+def _leave_root(libc: ctypes.CDLL, files: Sequence[str | Path]) -> bool:
+    """Become a user of its own, and say whether this process is root no more.
+
+    It stays root in a container that allows no other user, and if only root can read the files, as on some network file systems.
+    """
+    if os.geteuid() != 0:
+        return True
+    try:
+        os.setgroups([])
+        os.setresgid(_USER, _USER, _USER)
+        _called(libc.prctl(_KEEP_CAPABILITIES, 1, 0, 0, 0))
+        os.setresuid(_USER, _USER, 0)
+        wanted = _Capabilities(_CAPABILITIES_VERSION, 0, (_READ_CAPABILITY, _READ_CAPABILITY))
+        sets = ctypes.byref(wanted, _Capabilities.sets.offset)
+        _called(libc.capset(ctypes.byref(wanted), sets))
+        for path in files:
+            os.close(os.open(path, os.O_RDONLY))
+    except OSError:
+        os.setresuid(0, 0, 0)
+        return False
+    os.setresuid(_USER, _USER, _USER)
     return True
 
 

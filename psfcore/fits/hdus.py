@@ -103,7 +103,7 @@ def read_pixels(
         header, summary = image.header, summary_of(image, gzipped=source.gzipped)
         sums = Sum32()
         plain = None if summary.codec is not None else _plain_pixels(source, image, summary, sums)
-        skip_data(source, image, limits)
+        skip_data(source, image)
         # What follows an image is not needed to use it, so damage there is no error.
         with suppress(HeaderError):
             for one in hdus if others else ():

@@ -133,7 +133,7 @@ def read_first_image(
     """As `read_summary`, and the HDU of the image."""
     with open_source(Path(path), limits) as source:
         image = first_image(walk(source, limits), limits, hdu)
-        skip_data(source, image, limits)
+        skip_data(source, image)
         return summary_of(image, gzipped=source.gzipped), image
 
 

@@ -5,23 +5,25 @@ In memory, weights are float64 [y, x]. Files that this module writes hold float3
 
 from __future__ import annotations
 
+import math
+import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError
-from psfcore.fits.blocks import FitsLimits
+from psfcore.fits.blocks import FitsLimits, Hdu
 from psfcore.fits.cards import optional_number, optional_text
-from psfcore.fits.compression import read_columns
 from psfcore.fits.frame import plate_scale_arcsec
-from psfcore.fits.hdus import PIXEL_TROUBLE, as_written, ascii_text, read_pixels, write_hdus
+from psfcore.fits.hdus import as_written, ascii_text, read_pixels, readable_pixels, write_hdus
 from psfcore.fits.header import all_hdus, origin_of, wavelength_angstrom
+from psfcore.limited import run_limited, scratch_file
 from psfcore.psf import FittedShape, Psf, cumulative_curve, encircled_energy, radial_profile
 
 # The cards of the publication of a PSF, by their names in the provenance.
@@ -129,19 +131,6 @@ def _fitted_hdu(fitted: FittedShape) -> fits.BinTableHDU:
     return hdu
 
 
-def _read_fitted(hdu: fits.BinTableHDU) -> FittedShape:
-    table = hdu.data
-    return FittedShape(
-        shape=str(hdu.header["SHAPE"]),
-        parameters=tuple(str(name) for name in table["parameter"]),
-        coordinates=tuple(float(value) for value in table["coordinate"]),
-        covariance=tuple(
-            tuple(float(value) for value in row)
-            for row in np.atleast_2d(table["covariance"]).reshape(len(table), -1)
-        ),
-    )
-
-
 def read_psf(path: str | Path, limits: FitsLimits, *, parts: bool = True) -> Psf:
     """Read a PSF from the first 2-D image of a file, and its metadata from the header.
 
@@ -184,56 +173,89 @@ def stated_id(path: str | Path, limits: FitsLimits) -> str | None:
     Also None if the file was changed after `write_psf` wrote it (CHECKSUM and DATASUM of every HDU are checked), or if
     it was derived from the file of another PSF. Raises HeaderError.
     """
-    count = len(all_hdus(path, limits))
-    try:
-        with _first_hdus(path, count) as hdus:
-            lines = [str(line) for line in hdus[0].header.get("HISTORY", [])]
-            stated = [match[1] for line in lines if (match := _STATED.fullmatch(line))]
-            # `read_psf` keeps the HISTORY of a file under this name, and `write_psf` writes it into files derived from
-            # it.
-            derived = any(line.startswith("history:") for line in lines)
-            good = len(stated) == 1 and not derived and all(map(as_written, hdus))
-            return stated[0] if good else None
-    except PIXEL_TROUBLE:  # a damaged file, or one of other software; the job that uses it raises the error
+    hdus = all_hdus(path, limits)
+    lines = [str(line) for line in hdus[0].header.get("HISTORY", [])]
+    stated = [match[1] for line in lines if (match := _STATED.fullmatch(line))]
+    # `read_psf` keeps the HISTORY of a file under this name, and `write_psf` writes it into files derived from it.
+    if len(stated) != 1 or any(line.startswith("history:") for line in lines):
         return None
+    try:
+        with open(os.devnull, "wb") as unused:
+            good = run_limited(check_written, path, unused, pixels=_pixels(hdus), count=len(hdus))["good"]
+    except DataError:  # a damaged file, or one of other software; the job that uses it raises the error
+        return None
+    return stated[0] if good else None
+
+
+def check_written(_target: BinaryIO, *, path: str, count: int) -> dict[str, Any]:
+    """Whether the first HDUs of a file are as `write_psf` wrote them ("good"). Call it in a limited process (`psfcore.limited`)."""
+    with readable_pixels(path, "the HDUs"), _first_hdus(path, count) as hdus:
+        return {"good": all(map(as_written, hdus))}
 
 
 def _read_extras(
     path: str | Path, limits: FitsLimits, shape: tuple[int, ...]
 ) -> tuple[dict[str, NDArray[np.float64]], dict[str, Any], FittedShape | None]:
     """Components, provenance and fitted shape of a file that `write_psf` wrote."""
-    fitted: FittedShape | None = None
-    components: dict[str, NDArray[np.float64]] = {}
+    # Any file can have a card PSFNAME. Therefore the size limits are checked for all HDUs.
+    hdus = all_hdus(path, limits)
+    with scratch_file() as target:
+        extras = run_limited(
+            write_extras, path, target, pixels=_pixels(hdus), count=len(hdus), shape=list(shape)
+        )
+        target.seek(0)
+        components = {
+            str(name): np.fromfile(target, np.float64, math.prod(shape)).reshape(shape)
+            for name in extras["components"]
+        }
+    fitted = extras["fitted"]
+    return components, extras["provenance"], None if fitted is None else _fitted(**fitted)
+
+
+def write_extras(target: BinaryIO, *, path: str, count: int, shape: list[int]) -> dict[str, Any]:
+    """Write the components of a PSF to ``target``, float64; returns their names, the provenance and the fitted shape.
+
+    HDUs that `write_psf` never writes are ignored: compressed components, components of another shape, and tables with data
+    outside their rows. Call it in a limited process (`psfcore.limited`).
+    """
     provenance: dict[str, Any] = {}
-    # Any file can have a card PSFNAME. Therefore the size limits are checked for all HDUs. HDUs that write_psf never
-    # writes are ignored: compressed components, and components of another shape.
-    count = len(all_hdus(path, limits))
-    try:
-        with _first_hdus(path, count) as hdus:
-            provenance["history"] = [str(line) for line in hdus[0].header.get("HISTORY", [])]
-            for hdu in hdus[1:]:
-                if isinstance(hdu, fits.ImageHDU) and hdu.shape == shape:
-                    components[hdu.name] = np.array(hdu.data, dtype=np.float64)
-                elif not isinstance(hdu, fits.BinTableHDU) or any(
-                    column.in_heap for column in read_columns(hdu.header)
-                ):
-                    continue  # the tables of write_psf have no data outside their rows
-                elif hdu.name == "INSTRUMENT":
-                    provenance["instrument_toml"] = (
-                        np.asarray(hdu.data["TOML"][0], dtype=np.uint8).tobytes().decode("utf-8")
-                    )
-                elif hdu.name == "FIT":
-                    fitted = _read_fitted(hdu)
-    except PIXEL_TROUBLE as error:
-        raise DataError(
-            "unreadable-pixels",
-            f"expected readable extensions in {Path(path).name}; got: {error!s:.120}: copy or make the file again",
-        ) from None
-    return components, provenance, fitted
+    extras: dict[str, Any] = {"components": [], "provenance": provenance, "fitted": None}
+    with readable_pixels(path, "the extensions"), _first_hdus(path, count) as hdus:
+        provenance["history"] = [str(line) for line in hdus[0].header.get("HISTORY", [])]
+        for hdu in hdus[1:]:
+            if (
+                isinstance(hdu, fits.ImageHDU)
+                and hdu.shape == tuple(shape)
+                and hdu.name not in extras["components"]
+            ):
+                extras["components"].append(hdu.name)
+                target.write(np.ascontiguousarray(hdu.data, dtype=np.float64).data)
+            elif not isinstance(hdu, fits.BinTableHDU) or {"P", "Q"} & set("".join(hdu.columns.formats)):
+                continue
+            elif hdu.name == "INSTRUMENT":
+                toml = np.asarray(hdu.data["TOML"][0], dtype=np.uint8)
+                provenance["instrument_toml"] = toml.tobytes().decode("utf-8")
+            elif hdu.name == "FIT":
+                extras["fitted"] = {"shape": str(hdu.header["SHAPE"])} | {
+                    f"{name}s": hdu.data[name].tolist() for name in ("parameter", "coordinate", "covariance")
+                }
+    return extras
+
+
+def _fitted(
+    shape: str, parameters: list[str], coordinates: list[float], covariances: list[Any]
+) -> FittedShape:
+    rows = np.reshape(covariances, (len(parameters), -1)).tolist()  # of one parameter, a row is a number
+    return FittedShape(shape, tuple(parameters), tuple(coordinates), tuple(map(tuple, rows)))
+
+
+def _pixels(hdus: Sequence[Hdu]) -> int:
+    """The number of pixels that the data of HDUs explain, as floats."""
+    return sum(hdu.end - hdu.start for hdu in hdus) // 4
 
 
 @contextmanager
-def _first_hdus(path: str | Path, count: int) -> Iterator[list[Any]]:
+def _first_hdus(path: str, count: int) -> Iterator[list[Any]]:
     """The first HDUs of a file. count: as many as `all_hdus` finds.
 
     If a damaged size ends an HDU too early, astropy takes what follows for a header, and may read on without an end.

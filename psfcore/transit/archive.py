@@ -13,25 +13,24 @@ import hashlib
 import io
 import re
 import tarfile
-import zlib
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import IO, BinaryIO, cast
 
 from psfcore.errors import DataError, together
+from psfcore.fits.gzipped import GZIP_START
 from psfcore.limited import run_limited
 from psfcore.transit.admission import ArchiveLimits, is_plain_name
 from psfcore.transit.manifest import MANIFEST_NAME, TransitManifest, parse_manifest, read_manifest
 from psfcore.transit.members import START_BYTES as START_BYTES
-from psfcore.transit.members import Copied, Kind, copy_bytes, copy_files
+from psfcore.transit.members import Copied, Kind, copy_bytes, copy_files, plain_start
 from psfcore.transit.members import archive_kind as archive_kind
 from psfcore.transit.members import could_be_archive as could_be_archive
 
-_GZIP = b"\x1f\x8b"
-_FITS_STARTS = (b"SIMPLE  =", _GZIP)
+_FITS_STARTS = (b"SIMPLE  =", GZIP_START)
 _HEADER_BYTES = 4 * 2880  # contain the header of the first image, also if it is compressed in an extension
 _AXIS = re.compile(rb"(Z?NAXIS[12]) *= +(\d{1,9}) ")
 SECONDS, BYTES_A_SECOND = (
@@ -149,7 +148,8 @@ def _files_in(
         found = [Copied(*row) for row in answer["files"]]
         if not all(is_plain_name(file.name) for file in found):  # the process may have been misused
             raise DataError("archive-broken", "expected plain file names; got others: pack the archive again")
-        yield answer["kind"], found, archive if answer["kind"] == "tar" else content
+        in_archive = answer["kind"] == "tar" and start_bytes is None
+        yield answer["kind"], found, archive if in_archive else content
 
 
 def pack(folder: str | Path, path: str | Path) -> TransitManifest:
@@ -175,7 +175,7 @@ def checked_folder(folder: Path) -> ArchiveContents:
     for name in manifest.files:
         if (folder / name).is_file():
             with (folder / name).open("rb") as file:
-                starts[name] = file.read(_HEADER_BYTES)
+                starts[name] = plain_start(file, _HEADER_BYTES)
     _check_files(manifest, starts, str(folder))
     files = {name: (folder / name).stat().st_size for name in (MANIFEST_NAME, *manifest.files)}
     return ArchiveContents("tar", manifest, files, _pixels(manifest, starts, files))
@@ -186,9 +186,6 @@ def _pixels(manifest: TransitManifest, starts: Mapping[str, bytes], files: Mappi
     count = 0
     for name in {image.file for image in manifest.images}:
         start = starts[name]
-        if start.startswith(_GZIP):
-            with suppress(zlib.error):
-                start = zlib.decompressobj(zlib.MAX_WBITS | 16).decompress(start, _HEADER_BYTES)
         axes = {key: int(length) for key, length in _AXIS.findall(start)}
         ny, nx = (axes.get(b"ZNAXIS" + n, axes.get(b"NAXIS" + n, 0)) for n in (b"2", b"1"))
         count += ny * nx or files[name] // BYTES_A_PIXEL

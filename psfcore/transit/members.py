@@ -14,12 +14,13 @@ import tarfile
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import IO, Any, BinaryIO, Literal, NamedTuple, cast
 
 from psfcore.errors import DataError
+from psfcore.fits.gzipped import GZIP_START
 from psfcore.transit.admission import (
     MANIFEST_NAME,
     MAX_MANIFEST_BYTES,
@@ -37,7 +38,7 @@ _PIECE_BYTES = 1 << 16  # a larger piece gets new memory from the system each ti
 _STARTS: tuple[tuple[Literal["zip", "tar", "gzip"], int, bytes], ...] = (
     ("zip", 0, b"PK\x03\x04"),
     ("zip", 0, b"PK\x05\x06"),
-    ("gzip", 0, b"\x1f\x8b"),
+    ("gzip", 0, GZIP_START),
     ("tar", 257, b"ustar"),
 )
 _NO_PLAIN_FILE = "expected only plain files, no links, devices or sparse files"
@@ -69,8 +70,8 @@ def archive_kind(start: bytes) -> Literal["zip", "tar", "gzip"] | None:
 
 
 class Copied(NamedTuple):
-    """A file of an archive, and where its first ``length`` bytes are: from position ``at`` of the target of ``copy_files``, or of
-    the archive itself if it is a .tar, which holds plain bytes. size_bytes: the declared size."""
+    """A file of an archive, and where its bytes are: ``length`` bytes from position ``at`` of the target of ``copy_files``, or of
+    the archive itself if whole files of a .tar were asked for, which holds plain bytes. size_bytes: the declared size."""
 
     name: str
     size_bytes: int
@@ -97,7 +98,7 @@ class _Entry:
 def copy_files(
     target: BinaryIO, *, path: str, limits: dict[str, Any], start_bytes: int | None
 ) -> dict[str, Any]:
-    """Find the files of a transit in its archive, and copy them to ``target`` unless it is a .tar. Call it in a limited process.
+    """Find the files of a transit in its archive, and copy them to ``target``. Call it in a limited process.
 
     Returns "kind", and "files" with the values of a ``Copied`` for each file. Files of folders beside the transit are
     checked too; their bytes in ``target`` mean nothing.
@@ -111,7 +112,8 @@ def copy_files(
     limits
         The values of ``ArchiveLimits``.
     start_bytes
-        How many bytes to copy of each file; None: all bytes. Of transit.json, MAX_MANIFEST_BYTES and one more are copied.
+        How many bytes to copy of the start of each file, see `plain_start`; None: all bytes. Of transit.json,
+        MAX_MANIFEST_BYTES and one more are copied.
 
     Raises DataError "not-an-archive", "archive-climbs", "archive-not-plain", "archive-too-large", "archive-broken".
     An OSError of the disk is raised unchanged.
@@ -130,16 +132,29 @@ def copy_files(
                 raise not_plain(entry.name, entry.fault)
             if file is None or gate.is_beside(file):
                 continue
-            count = entry.size_bytes
+            at, count = entry.at, entry.size_bytes
             if start_bytes is not None:
-                count = min(count, MAX_MANIFEST_BYTES + 1 if file.name == MANIFEST_NAME else start_bytes)
-            at = target.tell() if entry.at is None else entry.at
-            found.append((file, Copied(file.name, entry.size_bytes, at, count)))
-            if entry.at is None:
+                with entry.open() as stream:
+                    start = plain_start(
+                        stream, MAX_MANIFEST_BYTES + 1 if file.name == MANIFEST_NAME else start_bytes
+                    )
+                at, count = target.tell(), target.write(start)
+            elif at is None:
+                at = target.tell()
                 with entry.open() as stream:  # it ends at the declared size; zipfile then checks the CRC
                     copy_bytes(stream, target, count, entry.name)
+            found.append((file, Copied(file.name, entry.size_bytes, at, count)))
         main = gate.main_folder()
     return {"kind": kind, "files": [copied for file, copied in found if file.folder == main]}
+
+
+def plain_start(file: IO[bytes], count: int) -> bytes:
+    """The first bytes of a file, decompressed if it is in gzip; as they stand if that fails."""
+    start = file.read(count)
+    if start.startswith(GZIP_START):
+        with suppress(zlib.error):
+            return zlib.decompressobj(zlib.MAX_WBITS | 16).decompress(start, count)
+    return start
 
 
 def copy_bytes(source: IO[bytes], target: IO[bytes], count: int, name: str) -> None:

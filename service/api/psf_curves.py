@@ -6,24 +6,27 @@ A job makes the tables when it builds or fits a PSF. An uploaded PSF has no tabl
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Annotated, Any
+from pathlib import Path
+from typing import Annotated, Any, BinaryIO
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
-from fastapi.responses import JSONResponse, StreamingResponse
+from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
 
-from psfcore.fits.stored_psf import Cutout, cutout
+from psfcore.fits.stored_psf import write_cutout
 from psfcore.tables import lookup as psf_lookup
 from service.http import files
 from service.http.callers import Caller, Reading
+from service.http.cutouts import cutout_of
+from service.http.gate import in_turn
 from service.http.problems import RESPONSES, Problem, as_problems
 from service.http.state import Shared, State
 from workers.catalogue.tables import PsfRow
 from workers.contract.requests import Identity
 
 # This number is part of every ETag. Increase it when a new version of the code gives other answers for the same tables.
-ANSWERS_VERSION = 1
+ANSWERS_VERSION = 2
 router = APIRouter(prefix="/v1/psfs", tags=["PSFs"], responses=RESPONSES)
 
 Radius = Annotated[float, Query(description="distance from the PSF's centre, px")]
@@ -101,8 +104,10 @@ class ComparisonAnswer(BaseModel):
     resolution: str
 
 
-@router.get(
-    "/{psf_id}/curve", summary="Light beyond radii (1 - encircled energy)", response_model=CurveAnswer
+@in_turn(
+    router.get(
+        "/{psf_id}/curve", summary="Light beyond radii (1 - encircled energy)", response_model=CurveAnswer
+    )
 )
 def get_curve(
     psf_id: Identity,
@@ -119,14 +124,18 @@ def get_curve(
     return _answer(request, caller, state, [psf_id], lambda tables: psf_lookup.curve(tables, radii_px))
 
 
-@router.get("/{psf_id}/profile", summary="Mean weight by radius", response_model=ProfileAnswer)
+@in_turn(router.get("/{psf_id}/profile", summary="Mean weight by radius", response_model=ProfileAnswer))
 def get_profile(psf_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """The mean weight in each ring, and the variation of the weights along the ring."""
     return _answer(request, caller, state, [psf_id], psf_lookup.profile)
 
 
-@router.get(
-    "/{psf_id}/encircled", summary="Light within a radius (encircled energy)", response_model=EncircledAnswer
+@in_turn(
+    router.get(
+        "/{psf_id}/encircled",
+        summary="Light within a radius (encircled energy)",
+        response_model=EncircledAnswer,
+    )
 )
 def get_encircled(
     psf_id: Identity, radius: Radius, request: Request, caller: Reading, state: Shared
@@ -135,7 +144,7 @@ def get_encircled(
     return _answer(request, caller, state, [psf_id], lambda tables: psf_lookup.encircled(tables, radius))
 
 
-@router.get("/{psf_id}/annulus", summary="Light between two radii", response_model=AnnulusAnswer)
+@in_turn(router.get("/{psf_id}/annulus", summary="Light between two radii", response_model=AnnulusAnswer))
 def get_annulus(
     psf_id: Identity, inner: Radius, outer: Radius, request: Request, caller: Reading, state: Shared
 ) -> Response:
@@ -143,7 +152,9 @@ def get_annulus(
     return _answer(request, caller, state, [psf_id], lambda tables: psf_lookup.annulus(tables, inner, outer))
 
 
-@router.get("/{psf_id}/compare/{other_id}", summary="Compare two PSFs", response_model=ComparisonAnswer)
+@in_turn(
+    router.get("/{psf_id}/compare/{other_id}", summary="Compare two PSFs", response_model=ComparisonAnswer)
+)
 def get_comparison(
     psf_id: Identity, other_id: Identity, request: Request, caller: Reading, state: Shared
 ) -> Response:
@@ -165,14 +176,11 @@ async def get_cutout(
     if (same := files.not_modified(request, headers)) is not None:
         return same
 
-    def cut() -> Cutout:
-        return cutout(files.path_of(state.store, row.file_sha256, row.bytes), size, state.settings.psf_limits)
+    def write(path: Path, target: BinaryIO) -> None:
+        write_cutout(path, size, state.settings.psf_limits, target)
 
-    with as_problems():
-        part = await state.pixels.run(caller.owner, cut)
-    headers["Content-Disposition"] = f'attachment; filename="psf-{psf_id[:12]}-{size}px.fits"'
-    headers["Content-Length"] = str(part.length)
-    return StreamingResponse(part.pieces(), media_type=files.FITS_TYPE, headers=headers)
+    filename = f"psf-{psf_id[:12]}-{size}px.fits"
+    return await cutout_of(state, caller.owner, row, write, filename=filename, headers=headers)
 
 
 def tables_of(state: State, caller: Caller, psf_id: str) -> Mapping[str, Any]:

@@ -11,20 +11,19 @@ Sun moves in the equatorial coordinates that SODA demands; so the service does n
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Literal
 
 from fastapi import APIRouter, Request, Response
 from fastapi.concurrency import run_in_threadpool
-from fastapi.responses import StreamingResponse
 
 from service.http import files
 from service.http.callers import Caller, Reading
+from service.http.cutouts import cutout_of
 from service.http.files import FITS_TYPE, GZIP_TYPE
-from service.http.problems import Problem, as_problems
-from service.http.quotas import check_disk
+from service.http.problems import Problem
 from service.http.state import Shared, State
 from service.vo.lists import LINKS_STANDARD, LINKS_TYPE, PSF, VOTABLE_ERROR, VotableErrors, did, row_named
 from service.vo.parameters import (
@@ -53,7 +52,6 @@ ANSWERS_VERSION = 1
 Frame = Literal["pixel", "helioprojective"]
 FRAMES: tuple[Frame, ...] = ("pixel", "helioprojective")
 MOST_CORNERS = 100
-PIECE_BYTES = 2**20
 # The numbers of each shape, as a message shows them.
 SHAPES = {
     "circle": "x y radius",
@@ -238,11 +236,14 @@ async def get_region(request: Request, caller: Reading, state: Shared, fields: F
     headers = files.headers_of(f"{ANSWERS_VERSION} {row.file_sha256} {shape} {numbers} {frame}")
     if (same := files.not_modified(request, headers)) is not None:
         return same
-    with as_problems():
-        file = await state.pixels.run(caller.owner, _written, state, row, shape, numbers, frame)
-    headers["Content-Disposition"] = f'attachment; filename="product-{row.id[:12]}-cutout.fits"'
-    headers["Content-Length"] = str(file.seek(0, io.SEEK_END))
-    return StreamingResponse(_pieces(file), media_type=files.FITS_TYPE, headers=headers)
+
+    def write(path: Path, target: BinaryIO) -> None:
+        from psfcore.fits.viewing.regions import write_cutout  # loads the numerical libraries
+
+        write_cutout(path, _region(shape, numbers, frame), state.limits, target)
+
+    filename = f"product-{row.id[:12]}-cutout.fits"
+    return await cutout_of(state, caller.owner, row, write, filename=filename, headers=headers)
 
 
 def described_cutout(identity: str, base: str) -> Service:
@@ -284,29 +285,6 @@ def _region_of(fields: Mapping[str, list[str]]) -> tuple[str, tuple[float, ...],
     if frame is None:
         refuse("FRAME", " or ".join(FRAMES), named)
     return shape, numbers, frame
-
-
-def _written(state: State, row: ProductRow, shape: str, numbers: tuple[float, ...], frame: Frame) -> BinaryIO:
-    """The cut-out in an open file without a name, which is gone when the file is closed."""
-    from psfcore.fits.viewing.regions import write_cutout  # loads the numerical libraries
-
-    check_disk(state)
-    path = files.path_of(state.store, row.file_sha256, row.bytes)
-    with state.store.temporary() as target:
-        file = target.open("w+b")
-        try:
-            write_cutout(path, _region(shape, numbers, frame), state.limits, file)
-        except BaseException:
-            file.close()
-            raise
-    return file
-
-
-def _pieces(file: BinaryIO) -> Iterator[bytes]:
-    with file:
-        file.seek(0)
-        while piece := file.read(PIECE_BYTES):
-            yield piece
 
 
 def _region(shape: str, numbers: tuple[float, ...], frame: Frame) -> Region:

@@ -84,6 +84,37 @@ def test_what_people_import_stands_on_the_core_the_client_and_the_machine_alone(
     assert wrong == []
 
 
+# Where the libraries that take files of strangers apart may be imported, and why. Everything in "child" runs in a limited process.
+UNPACKING = {
+    "psfcore/fits/gzipped.py": "child",
+    "psfcore/fits/hdus.py": "child; zlib.error is one of the errors that it tells",
+    "psfcore/transit/members.py": "child; and the starts of files in a folder of the user's own",
+    "psfcore/files.py": "writes gzip",
+    "psfcore/transit/archive.py": "writes .tar",
+    "psfcore/drawing/thumbnail.py": "writes PNG",
+    "psfcore/scatter/kept.py": "names the errors of numpy.load for files that it wrote",
+    "service/pages/assets.py": "writes gzip of its own pages",
+}
+# Where astropy opens a whole file, with its tables and tiles.
+OPENING = {
+    "psfcore/fits/hdus.py": "child",
+    "psfcore/fits/psfs.py": "child",
+    "psfcore/fits/viewing/regions.py": "child",
+    "psfcore/fits/images.py": "reads planes of products that this service wrote",
+}
+
+
+def test_files_of_strangers_are_taken_apart_in_the_limited_process_alone() -> None:
+    unpacking, opening = set(), set()
+    for path in (one for package in ("psfcore", "workers", "service") for one in sources(package)):
+        if {"bz2", "gzip", "lzma", "tarfile", "zipfile", "zlib"} & set(imports(path)):
+            unpacking.add(str(path.relative_to(HERE)))
+        calls = (node.func for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call))
+        if {"fits.open", "fits.getdata"} & set(map(ast.unparse, calls)):
+            opening.add(str(path.relative_to(HERE)))
+    assert (unpacking, opening) == (set(UNPACKING), set(OPENING))
+
+
 # Of psfcore the service reads what shows without a pixel: FITS headers, and a transit's archive and manifest, whose
 # table of contents is checked at upload as headers are. None of these loads numerics.
 LIGHT = (

@@ -74,7 +74,9 @@ def test_plate_scales_must_agree_to_a_percent_where_known() -> None:
         (None, None, True),
         (0.0, "arcsec", True),
         (7.0, "furlong", True),
-        ("7.0", "arcsec", True),  # a text
+        ("0.492", "arcsec", True),  # a number written as a text is a number
+        ("7.0", "arcsec", False),
+        ("about 7", "arcsec", True),
         (True, "arcsec", True),
     ):
         cards = {

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import io
 import json
 from collections.abc import Callable, Iterator
@@ -166,9 +165,6 @@ def test_invalid_parameters_are_refused(served: Served, psf_file: Path, tmp_path
     for question, status, code in BAD:
         answer = api.get(f"/v1/psfs/{built['id']}/{question}")
         assert refusal(answer, status, code), question
-    (tmp_path / "p.fits.gz").write_bytes(gzip.compress(psf_file.read_bytes()))
-    packed = upload(api, tmp_path / "p.fits.gz", "/v1/psfs")
-    refusal(api.get(f"/v1/psfs/{packed}/cutout?size=7"), 409, "cutout-not-plain")
     missing = api.post("/v1/jobs", json={"kind": "psf-tables", "parameters": {"psf_id": A}})
     refusal(missing, 404, "no-such-psf")
 

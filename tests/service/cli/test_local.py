@@ -19,7 +19,7 @@ from psfcore.files import sha256_of
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.psfs import read_psf
 from psfcore.fits.psfs import write_psf as write_built
-from psfcore.fits.stored_psf import cutout
+from psfcore.fits.stored_psf import write_cutout
 from psfcore.instruments import files
 from psfcore.psf_sampling import rebinned
 from psfcore.transit.archive import pack
@@ -102,11 +102,15 @@ def test_a_file_that_was_changed_does_not_keep_the_id(built: tuple[Path, str], t
         shutil.copyfile(file, changed)
         fits.setval(changed, "PSFNAME", value="mine")
 
+    def cut(changed: Path) -> None:
+        with changed.open("wb") as target:
+            write_cutout(file, 32, limits, target)
+
     changes: dict[str, Callable[[Path], object]] = {
         "pixel": pixel,
         "card": card,
         "rebinned": lambda changed: write_built(changed, rebinned(read_psf(file, limits), 2)),
-        "cutout": lambda changed: cutout(file, 32, limits).write(changed),
+        "cutout": cut,
         "rewritten": lambda changed: write_built(changed, read_psf(file, limits)),
     }
     with local() as service:

@@ -1,0 +1,58 @@
+"""Answers that a limited process writes: a cut-out of a stored file goes into a file without a name, and then to the client."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+from fastapi.responses import StreamingResponse
+
+from service.http import files
+from service.http.problems import as_problems
+from service.http.quotas import check_disk
+from service.http.state import State
+from workers.catalogue.tables import ProductRow, PsfRow
+
+PIECE_BYTES = 2**20
+
+
+async def cutout_of(
+    state: State,
+    owner: str,
+    row: ProductRow | PsfRow,
+    write: Callable[[Path, BinaryIO], None],
+    *,
+    filename: str,
+    headers: dict[str, str],
+) -> StreamingResponse:
+    """The answer with the part of a stored file that ``write(path, target)`` writes, in the owner's turn.
+
+    Raises the errors of ``write`` as a Problem.
+    """
+
+    def written() -> BinaryIO:
+        check_disk(state)
+        path = files.path_of(state.store, row.file_sha256, row.bytes)
+        with state.store.temporary() as target:
+            file = target.open("w+b")
+            try:
+                write(path, file)
+            except BaseException:
+                file.close()
+                raise
+        return file
+
+    with as_problems():
+        file = await state.pixels.run(owner, written)
+    headers["Content-Disposition"] = f'attachment; filename="{filename}"'
+    headers["Content-Length"] = str(file.seek(0, io.SEEK_END))
+    return StreamingResponse(_pieces(file), media_type=files.FITS_TYPE, headers=headers)
+
+
+def _pieces(file: BinaryIO) -> Iterator[bytes]:
+    with file:
+        file.seek(0)
+        while piece := file.read(PIECE_BYTES):
+            yield piece
