@@ -9,6 +9,7 @@ from typing import Any
 
 from fastapi import FastAPI
 
+from psfcore import limited
 from psfcore.fits.viewing.planes import Planes
 from service import operation
 from service.api import (
@@ -47,6 +48,7 @@ from workers.settings import Settings, software_version
 SHORT = re.compile(r"\^\[0-9a-f\]\{(32|64)\}\$")
 PROBLEM = f"#/components/schemas/{problems.ProblemDocument.__name__}"
 AT_ONCE = 3  # works behind a gate; one owner alone gets all places but one
+STORED_AT_ONCE = 8  # most of them wait for the store
 
 
 def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
@@ -66,7 +68,7 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
         private_folder(settings.data_dir)
         catalogue = Catalogue(settings.catalogue_url)
         catalogue.upgrade()
-        store = open_store(settings)
+        store = open_store(settings, within_requests=True)
         store.sweep()
         reconciler = Reconciler(catalogue, store, queue.make_app(settings), settings)
         streams = AtOnce(settings.streams_per_caller, "too-many-streams", "streams of events")
@@ -81,10 +83,11 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
             streams,
             requests,
             pixels=Gate(AT_ONCE),
-            stored=Gate(AT_ONCE),
+            stored=Gate(STORED_AT_ONCE),
             planes=Planes(store.temporary),
         )
         reconciler.start()
+        limited.prepare()  # the first upload does not wait for it
         yield
         reconciler.stop()
         catalogue.close()

@@ -8,8 +8,9 @@ counter, which never decreases.
 
 from __future__ import annotations
 
+import asyncio
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, cast
 
 from fastapi import APIRouter, Request, Response
@@ -21,15 +22,14 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from service.http.callers import Administering
 from service.http.problems import RESPONSES, Problem, ProblemDocument
-from service.http.state import Shared, State
+from service.http.state import Shared, State, state_of
 from workers import checks
 from workers.catalogue.census import JobTally
 from workers.contract.jobs import Phase, Queue
 from workers.contract.kinds import KINDS
 from workers.settings import software_version
 
-OK = "ok"
-STOPPED = "the reconciler stopped, so queued jobs are not submitted; restart the service"
+STOPPED = "the reconciler has not succeeded for 30 s, so jobs are not submitted; read the log of the server"
 router = APIRouter(tags=["operation"])
 NOT_READY = {
     "model": ProblemDocument,
@@ -54,42 +54,51 @@ class Readiness(BaseModel):
     )
 
 
+# These two use no thread of the pool, all of which may wait for a neighbour that hangs.
 @router.get("/healthz", summary="Is the service up?", responses=RESPONSES)
-def healthz(state: Shared) -> Health:
+async def healthz(request: Request) -> Health:
     """200: process, reconciler and database work. 503: one of them does not work."""
-    state.catalogue.ping()
+    state = state_of(request)
+    answer = await _answers(state, {"answers of the database": lambda: checks.answers(state.catalogue)})
+    for fault in faults(answer):
+        raise Problem(503, "database-away", fault, headers={"Retry-After": "5"})
     if not state.reconciler.alive:
         raise Problem(503, "reconciler-stopped", STOPPED)
     return Health(status="ok", version=software_version())
 
 
 @router.get("/readyz", summary="Can the service do its work?", responses={503: NOT_READY})
-def readyz(state: Shared) -> Readiness:
+async def readyz(request: Request) -> Readiness:
     """200: database, storage, and broker (or embedded worker) answer, and workers take the jobs. 503: one of them does not; `parts` says which one."""
-    parts = states(state)
+    parts = await states(state_of(request))
     away = faults(parts)
     if away:
         raise Problem(503, "not-ready", "; ".join(away), parts=parts)
     return Readiness(status="ready", parts=parts)
 
 
-def states(state: State) -> dict[str, str]:
+async def states(state: State) -> dict[str, str]:
     """The state of each part that the service needs, by its name: "ok", or what is wrong."""
-    parts = {}
-    for name, check in checks.needed(state.settings, state.catalogue, state.store).items():
-        try:
-            check()
-            parts[name] = OK
-        except checks.Unusable as fault:
-            parts[name] = str(fault)
+    parts = await _answers(state, checks.needed(state.settings, state.catalogue, state.store))
     if not state.reconciler.alive:
         parts["reconciler"] = STOPPED
     return parts
 
 
+async def _answers(state: State, needed: Mapping[str, Callable[[], None]]) -> dict[str, str]:
+    """The result of each check. A check that takes longer than ``checks.CHECK_S`` is not waited for."""
+    asked = {name: asyncio.wrap_future(state.watch.ask(name, check)) for name, check in needed.items()}
+    if asked:
+        await asyncio.wait(asked.values(), timeout=checks.CHECK_S)
+    late = f"has not ended within {checks.CHECK_S:g} s"
+    return {
+        name: one.result() if one.done() else f"the check of the {name} {late}" for name, one in asked.items()
+    }
+
+
 def faults(parts: Mapping[str, str]) -> list[str]:
     """What is wrong with the parts that do not answer."""
-    return [state for state in parts.values() if state != OK]
+    return [state for state in parts.values() if state != checks.OK]
 
 
 @router.get(

@@ -1,16 +1,23 @@
 """Kill servers and workers at random while they process jobs: no job may be lost, done twice, or stuck.
 
-    python -m studies.chaos [--jobs 300] [--kills 30] [--px 256] [--seed 1] [--redis-keeps]
+    python -m studies.chaos [--jobs 300] [--kills 30] [--hang-s 60] [--s3] [--px 256] [--seed 1] [--redis-keeps]
 
 The study starts a PostgreSQL server, a Redis server, a service and two workers on free ports, with their files in a
-temporary folder. Each kill sends SIGKILL to a whole process group, which resembles a power failure. The killed process
-starts again a moment later. The client repeats each request until the service accepts it.
+temporary folder or, with --s3, in an S3 server (moto). Each kill sends SIGKILL to a whole process group, which
+resembles a power failure. The killed process starts again a moment later. The client repeats each request until the
+service accepts it.
+
+Each of the neighbours PostgreSQL, Redis and S3 is once stopped (SIGSTOP) for HANG seconds: it accepts connections, and
+answers nothing. ``/readyz`` must tell each outage, and its end, within 30 s.
+
+Without kills (--kills 0) the last lines show how the memory of a worker process grows with its jobs.
 """
 
 from __future__ import annotations
 
 import argparse
 import collections
+import hashlib
 import os
 import random
 import shutil
@@ -23,9 +30,12 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import cached_property, partial
 from pathlib import Path
 
 import httpx
+import psutil
+import s3fs
 from sqlalchemy import URL, Row, create_engine, text
 from sqlalchemy.exc import OperationalError
 
@@ -39,7 +49,10 @@ REST_S = (0.2, 3.0)  # time between the kill of a process and its new start
 PAUSE_S = (0.5, 6.0)  # time between two faults
 CLI = (sys.executable, "-m", "service.cli")
 STEPS = 20
+BUCKET = "chaos"
 DATABASES = ("postgresql", "redis", "s3")  # started before all others
+PARTS = {"postgresql": "database", "redis": "broker", "s3": "object store"}  # as ``/readyz`` names them
+TOLD_S = 30.0  # time in which ``/readyz`` must tell an outage, and its end
 
 
 @dataclass
@@ -79,6 +92,20 @@ class Process:
         self.start()
         self.resting = False
 
+    @contextmanager
+    def hanging(self) -> Iterator[None]:
+        """Stop all processes of the server while the block runs: its connections stay open, and nothing answers."""
+        assert self.running is not None
+        parent = psutil.Process(self.running.pid)
+        stopped = [parent, *parent.children(recursive=True)]
+        try:
+            for process in stopped:
+                process.suspend()
+            yield
+        finally:
+            for process in stopped:
+                process.resume()
+
     @property
     def alive(self) -> bool:
         """Whether the server runs."""
@@ -94,6 +121,8 @@ class Servers:
     database_port: int
     database_host: str = "127.0.0.1"
     stopped: threading.Event = field(default_factory=threading.Event)
+    told_s: dict[str, tuple[float, float]] = field(default_factory=dict)
+    worker_mib: list[float] = field(default_factory=list)
 
     def ask(self, query: str) -> Sequence[Row[tuple[object, ...]]]:
         """The rows that the database answers. Raises OperationalError while it does not."""
@@ -118,6 +147,34 @@ class Servers:
         with suppress(httpx.HTTPError):
             return httpx.get(f"{self.address}/healthz", timeout=2).is_success
         return False
+
+    def says(self, part: str) -> str:
+        """What ``/readyz`` says about a part; "no answer" if the service gives none."""
+        with suppress(httpx.HTTPError, ValueError):
+            return str(httpx.get(f"{self.address}/readyz", timeout=10).json()["parts"].get(part, "unknown"))
+        return "no answer"
+
+    def hang(self, name: str, hang_s: float) -> None:
+        """Let a server hang for a time. ``told_s`` then has the times until ``/readyz`` told it, and told its end."""
+        part = PARTS[name]
+        wait_for(lambda: self.says(part) == "ok", f"{name} is ready", START_S)
+        begun = time.monotonic()
+        with self.processes[name].hanging():
+            wait_for(lambda: self.says(part) not in ("ok", "no answer"), f"{name} is told", hang_s)
+            told_s = time.monotonic() - begun
+            self.stopped.wait(begun + hang_s - time.monotonic())
+        ended = time.monotonic()
+        wait_for(lambda: self.says(part) == "ok", f"the end of {name} is told", hang_s)
+        self.told_s[name] = (told_s, time.monotonic() - ended)
+
+    def note_memory(self) -> None:
+        """Note the memory of the largest process of a worker, MiB."""
+        with suppress(psutil.NoSuchProcess):
+            parents = [
+                one.running.pid for one in self.processes.values() if one.running and "worker" in one.name
+            ]
+            children = [child for pid in parents for child in psutil.Process(pid).children()]
+            self.worker_mib.append(max((one.memory_info().rss for one in children), default=0) / 2**20)
 
     def keep_running(self) -> None:
         """Restart servers that ended by themselves, as a supervisor (docker compose, systemd) does."""
@@ -250,6 +307,7 @@ def send(running: Servers, folder: Path, jobs: int, px: int) -> dict[str, str]:
             parameters = {"image_id": image_id, "psf_id": psf_id, "method": method}
             body = {"kind": "deconvolve", "parameters": parameters}
             sent[image_id] = patiently(client, "/v1/jobs", json=body)
+            running.note_memory()
     return sent
 
 
@@ -262,6 +320,7 @@ def worked_off(running: Servers, folder: Path, jobs: int, px: int, disturber: th
     disturber.join()
 
     def ended() -> bool:
+        running.note_memory()
         with suppress(OperationalError):
             over = "SELECT count(*) FROM jobs WHERE phase IN ('COMPLETED', 'ERROR', 'ABORTED')"
             return running.ask(over)[0][0] == jobs
@@ -280,27 +339,101 @@ def worked_off(running: Servers, folder: Path, jobs: int, px: int, disturber: th
     counts |= {f"kills of {process.name}": process.kills for process in running.processes.values()}
     for name, number in counts.items():
         print(f"  {name:<20} {number}")
+    for name, (told_s, ended_s) in running.told_s.items():
+        print(f"  {name} hung: told after {told_s:.1f} s, its end after {ended_s:.1f} s")
+        assert max(told_s, ended_s) <= TOLD_S, "each outage and its end are told in time"
+    tenth = running.worker_mib[len(running.worker_mib) // 10]
+    last, largest = running.worker_mib[-1], max(running.worker_mib)
+    print(
+        f"  a worker process: {tenth:.0f} MiB after a tenth, {last:.0f} MiB at the end, {largest:.0f} MiB at most"
+    )
     return {digest for product in products for digest in (product.file_sha256, product.preview_sha256)}
 
 
-def run(jobs: int, kills: int, px: int, seed: int, *, redis_keeps: bool) -> None:
+@dataclass(frozen=True)
+class ObjectStore:
+    """An S3 server (moto) and its bucket. It keeps objects in memory, so it must not be killed."""
+
+    host: str
+    port: int
+
+    def process(self, folder: Path) -> Process:
+        """The server, not started yet."""
+        command = [sys.executable, "-m", "moto.server", "-H", self.host, "-p", str(self.port)]
+        return Process("s3", command, os.environ, folder / "s3.log")
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """The settings of a service and its workers."""
+        return {
+            "AWS_ENDPOINT_URL": f"http://{self.host}:{self.port}",
+            "AWS_ACCESS_KEY_ID": "test",
+            "AWS_SECRET_ACCESS_KEY": "test",
+            "AWS_DEFAULT_REGION": "us-east-1",
+            "AWS_EC2_METADATA_DISABLED": "true",
+            "HELIOPSF_STORE_URL": f"s3://{BUCKET}/files",
+        }
+
+    def make_bucket(self) -> None:
+        """Make the bucket, once the server answers."""
+
+        def done() -> bool:
+            try:
+                self._client().mkdir(BUCKET)
+            except OSError:
+                return False
+            return True
+
+        wait_for(done, "the S3 server answers", START_S)
+
+    def sha256_of(self, digest: str) -> str:
+        """The SHA-256 of the content of a stored file."""
+        return hashlib.sha256(
+            self._reader.cat_file(f"{BUCKET}/files/blobs/{digest[:2]}/{digest}")
+        ).hexdigest()
+
+    @cached_property
+    def _reader(self) -> s3fs.S3FileSystem:
+        return self._client()  # for all files, because a client takes a second to make
+
+    def _client(self) -> s3fs.S3FileSystem:
+        return s3fs.S3FileSystem(
+            key="test",
+            secret="test",
+            endpoint_url=f"http://{self.host}:{self.port}",
+            skip_instance_cache=True,
+            use_listings_cache=False,
+        )
+
+
+def run(jobs: int, kills: int, px: int, seed: int, *, hang_s: float, s3: bool, redis_keeps: bool) -> None:
     """Run the study. Raises AssertionError, Missing."""
     rng = random.Random(seed)
     with tempfile.TemporaryDirectory(prefix="heliopsf-chaos-") as temporary:
         folder = Path(temporary)
         database, redis, port = free_port(), free_port(), free_port()
+        files = ObjectStore("127.0.0.1", free_port()) if s3 else None
         own = environment_of(folder / "data", "127.0.0.1", database, redis)
+        own |= {} if files is None else files.environment
         serve = Process("service", [*CLI, "serve", "--port", str(port)], own, folder / "service.log")
         workers = [Process(f"worker {k}", [*CLI, "worker"], own, folder / "workers.log") for k in (1, 2)]
         stores = [postgresql(folder, database), redis_server(folder, redis, keeps=redis_keeps)]
+        stores += [] if files is None else [files.process(folder)]
         (folder / "data").mkdir()
         processes = {process.name: process for process in [*stores, serve, *workers]}
         running = Servers(processes, f"http://127.0.0.1:{port}", database)
-        faults = [lambda: running.kill_one(rng)] * kills
+        faults = [partial(running.kill_one, rng, ("s3",))] * kills
+        if hang_s:
+            faults += [partial(running.hang, process.name, hang_s) for process in stores]
+        rng.shuffle(faults)
+        if files is not None:
+            threading.Thread(target=files.make_bucket, daemon=True).start()
         with running.started(), running.disturbed(faults, rng) as disturber:
             for digest in worked_off(running, folder, jobs, px, disturber):
                 path = folder / "data" / "blobs" / digest[:2] / digest
-                assert path.is_file() and sha256_of(path) == digest, f"{digest} is whole"
+                found = sha256_of(path) if files is None else files.sha256_of(digest)
+                assert found == digest, f"{digest} is whole"
+            assert not hang_s or running.told_s.keys() == {process.name for process in stores}
 
 
 def main() -> None:
@@ -310,11 +443,23 @@ def main() -> None:
     )
     parser.add_argument("--jobs", type=int, default=300)
     parser.add_argument("--kills", type=int, default=30)
+    parser.add_argument(
+        "--hang-s", type=float, default=60.0, help="time for which each neighbour hangs, s; 0: none hangs"
+    )
+    parser.add_argument("--s3", action="store_true", help="keep the files in an S3 server, which hangs too")
     parser.add_argument("--px", type=int, default=256)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--redis-keeps", action="store_true", help="let Redis write its append-only file")
     chosen = parser.parse_args()
-    run(chosen.jobs, chosen.kills, chosen.px, chosen.seed, redis_keeps=chosen.redis_keeps)
+    run(
+        chosen.jobs,
+        chosen.kills,
+        chosen.px,
+        chosen.seed,
+        hang_s=chosen.hang_s,
+        s3=chosen.s3,
+        redis_keeps=chosen.redis_keeps,
+    )
 
 
 if __name__ == "__main__":

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 import ctypes
-import hashlib
 import os
 import random
 import shutil
@@ -30,11 +29,9 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
-import s3fs
-
 from studies.chaos import (
     CLI,
-    START_S,
+    ObjectStore,
     Process,
     Servers,
     environment_of,
@@ -42,20 +39,13 @@ from studies.chaos import (
     redis_server,
     worked_off,
 )
-from tests.whole.stack import Missing, wait_for
+from tests.whole.stack import Missing
 
 NETWORK, FIRST = "10.77.0.0/24", "10.77.0.1"
 WORKERS = {"worker 1": "10.77.0.11", "worker 2": "10.77.0.12"}
 PORTS = {"postgresql": 5432, "redis": 6379, "s3": 9000, "service": 8765}
-BUCKET = "chaos"
 CLONE_NEWNET = 0x40000000
-KEYS = {
-    "AWS_ENDPOINT_URL": f"http://{FIRST}:{PORTS['s3']}",
-    "AWS_ACCESS_KEY_ID": "test",
-    "AWS_SECRET_ACCESS_KEY": "test",
-    "AWS_DEFAULT_REGION": "us-east-1",
-    "AWS_EC2_METADATA_DISABLED": "true",
-}
+FILES = ObjectStore(FIRST, PORTS["s3"])
 
 
 class Hosts:
@@ -182,13 +172,11 @@ def _at(namespace: str, name: str, command: Sequence[str]) -> list[str]:
 
 def servers(folder: Path, made: Hosts, apart_s: float) -> Servers:
     """All servers, not started yet. Raises Missing."""
-    shared = environment_of(folder, FIRST, PORTS["postgresql"], PORTS["redis"]) | KEYS
-    shared["HELIOPSF_STORE_URL"] = f"s3://{BUCKET}/files"
-    s3 = [sys.executable, "-m", "moto.server", "-H", FIRST, "-p", str(PORTS["s3"])]
+    shared = environment_of(folder, FIRST, PORTS["postgresql"], PORTS["redis"]) | FILES.environment
     processes = [
         postgresql(folder, PORTS["postgresql"], FIRST, NETWORK),
         redis_server(folder, PORTS["redis"], FIRST, keeps=False),
-        Process("s3", s3, os.environ, folder / "s3.log"),
+        FILES.process(folder),
     ]
     serve = [*CLI, "serve", "--host", "127.0.0.1", "--port", str(PORTS["service"])]
     commands = {"service": serve} | {name: _at(made.names[name], name, [*CLI, "worker"]) for name in WORKERS}
@@ -203,27 +191,6 @@ def servers(folder: Path, made: Hosts, apart_s: float) -> Servers:
         processes.append(Process(name, command, shared | own, data.with_suffix(".log")))
     address = f"http://127.0.0.1:{PORTS['service']}"
     return Servers({one.name: one for one in processes}, address, PORTS["postgresql"], FIRST)
-
-
-def _object_store() -> s3fs.S3FileSystem:
-    return s3fs.S3FileSystem(
-        key=KEYS["AWS_ACCESS_KEY_ID"],
-        secret=KEYS["AWS_SECRET_ACCESS_KEY"],
-        endpoint_url=KEYS["AWS_ENDPOINT_URL"],
-        skip_instance_cache=True,
-        use_listings_cache=False,
-    )
-
-
-def _make_bucket() -> None:
-    def done() -> bool:
-        try:
-            _object_store().mkdir(BUCKET)
-        except OSError:
-            return False
-        return True
-
-    wait_for(done, "the S3 server answers", START_S)
 
 
 def run(jobs: int, faults: int, px: int, seed: int, *, cuts: int, cut_s: float, apart_s: float) -> None:
@@ -242,15 +209,14 @@ def run(jobs: int, faults: int, px: int, seed: int, *, cuts: int, cut_s: float, 
         # moto keeps objects in memory, so it is not killed.
         disturbances += [partial(running.kill_one, rng, ("s3",))] * (faults - cuts)
         rng.shuffle(disturbances)
-        bucket = threading.Thread(target=_make_bucket, daemon=True)
+        bucket = threading.Thread(target=FILES.make_bucket, daemon=True)
         bucket.start()
         with running.started():
             bucket.join()
             with running.disturbed(disturbances, rng) as disturber:
                 digests = worked_off(running, folder, jobs, px, disturber)
                 for digest in digests:
-                    content = _object_store().cat_file(f"{BUCKET}/files/blobs/{digest[:2]}/{digest}")
-                    assert hashlib.sha256(content).hexdigest() == digest, f"{digest} is whole"
+                    assert FILES.sha256_of(digest) == digest, f"{digest} is whole"
         print(f"every file in S3 is whole; clocks {apart_s:g} s apart, {cuts} cuts of {cut_s:g} s")
 
 

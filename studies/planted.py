@@ -84,7 +84,7 @@ FAULTS = (
     Fault("fits-psf-centre-half-a-pixel-off", "psfcore/fits/psfs.py",
           '(size // 2 + 1.0, ', '(size / 2 + 0.5, '),
     Fault("fits-short-file-accepted", "psfcore/fits/blocks.py",
-          'there = self._left(count)', 'there = count'),
+          'there = self._there(count)', 'there = count'),
     Fault("fits-size-limit-per-axis", "psfcore/fits/blocks.py",
           'if nx * ny > limits.max_pixels:', 'if max(nx, ny) > limits.max_pixels:'),
     Fault("diffraction-weights-of-lines-ignored", "psfcore/diffraction/combined.py",

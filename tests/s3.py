@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import atexit
 import logging
+import random
+import threading
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -37,6 +39,71 @@ def shared_server() -> ThreadedMotoServer:
     server = started_server()
     atexit.register(server.stop)
     return server
+
+
+# --- wrong answers ---------------------------------------------------------------------------------------
+
+_CANNED = {
+    "no such bucket": (404, "NoSuchBucket"),
+    "no such key": (404, "NoSuchKey"),
+    "404": (404, None),
+    "500": (500, "InternalError"),
+}
+WRONG = (*_CANNED, "hang", "hang when done", "cut")
+
+
+class Faulty:
+    """The application of a server, which answers some requests wrongly: as ``_CANNED`` says, or never ("hang": and does
+    nothing; "hang when done"), or with half a body ("cut").
+
+    asked, faults: numbers of requests and of wrong answers.
+    """
+
+    def __init__(self, server: ThreadedMotoServer, seed: int = 1) -> None:
+        about: Any = server._server
+        self._app, about.app = about.app, self
+        self.asked, self.faults = 0, 0
+        self._share, self._kinds, self._hang_s = 0.0, WRONG, 0.0
+        self._chance, self._lock, self._end = random.Random(seed), threading.Lock(), threading.Event()
+
+    @contextmanager
+    def answering(self, *kinds: str, share: float = 1.0, hang_s: float = 60.0) -> Iterator[None]:
+        """Answer this share of the requests wrongly during the block. kinds: of ``WRONG``; none: all."""
+        self._share, self._kinds, self._hang_s = share, kinds or WRONG, hang_s
+        self._end.clear()
+        try:
+            yield
+        finally:
+            self._share = 0.0
+            self._end.set()
+
+    def __call__(self, environ: dict[str, Any], start: Callable[..., Any]) -> Iterable[bytes]:
+        with self._lock:
+            self.asked += 1
+            wrong = self._chance.random() < self._share
+            kind = self._chance.choice(self._kinds) if wrong else None
+            self.faults += wrong
+        if kind is None or (kind == "cut" and environ["REQUEST_METHOD"] == "HEAD"):  # which has no body
+            return self._app(environ, start)  # type: ignore[no-any-return]
+        if kind not in ("hang when done", "cut"):
+            environ["wsgi.input"].read(int(environ.get("CONTENT_LENGTH") or 0))
+        if kind in _CANNED:
+            status, code = _CANNED[kind]
+            body = "" if code is None else f"<?xml version='1.0'?><Error><Code>{code}</Code></Error>"
+            sent = b"" if environ["REQUEST_METHOD"] == "HEAD" else body.encode()
+            start(
+                f"{status} Wrong", [("Content-Length", str(len(sent))), ("Content-Type", "application/xml")]
+            )
+            return [sent]
+        answer: list[Any] = []
+        body = b"" if kind == "hang" else b"".join(self._app(environ, lambda *given: answer.extend(given)))
+        if kind == "cut":
+            headers = [one for one in answer[1] if one[0].lower() not in ("content-length", "connection")]
+            start(answer[0], [*headers, ("Content-Length", str(len(body) + 100)), ("Connection", "close")])
+            return [body[: len(body) // 2]]
+        self._end.wait(self._hang_s)
+        start("503 Late", [("Content-Length", "0"), ("Connection", "close")])
+        return [b""]
 
 
 @contextmanager

@@ -24,7 +24,7 @@ def copied_tables(folder: Path) -> Iterator[None]:
     """While this context is active, a new SQLite database of this process starts as a copy of one in ``folder``."""
     made, one_at_a_time = folder / "made.sqlite", threading.Lock()
 
-    def upgrade(schema: Schema) -> None:
+    def upgrade(schema: Schema) -> Path | None:
         database = schema._database.engine.url.database
         if schema._database.sqlite and database not in (None, ":memory:"):
             with one_at_a_time:
@@ -37,7 +37,7 @@ def copied_tables(folder: Path) -> Iterator[None]:
                     partial = target.with_suffix(".partial")
                     partial.write_bytes(made.read_bytes())
                     os.replace(partial, target)
-        RUN_REVISIONS(schema)
+        return RUN_REVISIONS(schema)
 
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(Schema, "upgrade", upgrade)

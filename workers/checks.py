@@ -9,46 +9,85 @@ import re
 import shutil
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from pathlib import Path
 from tempfile import TemporaryFile
+from threading import Lock, Thread
 from weakref import WeakKeyDictionary
 
 from sqlalchemy.exc import SQLAlchemyError
 
 from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.database import READ_ONLY, sqlstate_of
 from workers.files.store import Store
 from workers.settings import Settings
+
+OK = "ok"
 
 
 class Unusable(Exception):
     """Something that the service needs does not work."""
 
 
-# For each catalogue: the time until which the result of its last check of the pages is used again.
-_pages_good_until: WeakKeyDictionary[Catalogue, float] = WeakKeyDictionary()
+CHECK_S = 5.0  # time after which something that has not answered counts as away
+PAGES_S = CHECK_S / 2  # longest time that a check waits for the pages of a database
+_pages: WeakKeyDictionary[Catalogue, _Pages] = WeakKeyDictionary()
 PAGES_SHARE = 0.01  # largest share of the time that is spent on checking the pages
 # While workers do nothing, a waiting job is sent to them every ``resubmit_s``. They count as deaf after this number of times.
 RESUBMISSIONS = 4
 
 
 def database(catalogue: Catalogue) -> None:
-    """Check that the database answers and that its file is not damaged.
+    """Check that the database answers, that it accepts changes, and that its file is not damaged.
 
-    The check reads the whole file of an SQLite database. The longer this takes, the less often it is done.
+    The last check reads the whole file of an SQLite database. The longer this takes, the less often it is done. While a
+    large file is being read, it counts as good.
     """
+    _ask(catalogue.ping)
+    _ask(catalogue.check_writable)
+    _pages.setdefault(catalogue, _Pages()).check(catalogue)
+
+
+def answers(catalogue: Catalogue) -> None:
+    """Check that the database answers."""
+    _ask(catalogue.ping)
+
+
+class _Pages:
+    """The checks of the pages of a database, in a thread, because a large file takes longer than a check may."""
+
+    def __init__(self) -> None:
+        self._fault: Unusable | None = None
+        self._good_until = 0.0
+        self._reader: Thread | None = None
+
+    def check(self, catalogue: Catalogue) -> None:
+        """Raise the fault that was found. Read the pages again if it is time, and wait a moment for the result."""
+        reader = self._reader
+        if (reader is None or not reader.is_alive()) and time.monotonic() >= self._good_until:
+            reader = self._reader = Thread(target=self._read, args=(catalogue,), name="pages", daemon=True)
+            reader.start()
+        if reader is not None:
+            reader.join(PAGES_S)
+        if self._fault is not None:
+            raise self._fault
+
+    def _read(self, catalogue: Catalogue) -> None:
+        started = time.monotonic()
+        try:
+            catalogue.check_pages()
+        except SQLAlchemyError as error:
+            self._fault = _damage(error)
+            return
+        ended = time.monotonic()
+        self._fault, self._good_until = None, ended + (ended - started) / PAGES_SHARE
+
+
+def _ask(question: Callable[[], None]) -> None:
     try:
-        catalogue.ping()
+        question()
     except SQLAlchemyError as error:
         raise (_damage(error) if damaged(error) else _silent(error)) from error
-    started = time.monotonic()
-    if started < _pages_good_until.get(catalogue, 0.0):
-        return
-    try:
-        catalogue.check_pages()
-    except SQLAlchemyError as error:
-        raise _damage(error) from error
-    ended = time.monotonic()
-    _pages_good_until[catalogue] = ended + (ended - started) / PAGES_SHARE
 
 
 def _damage(error: SQLAlchemyError) -> Unusable:
@@ -56,7 +95,8 @@ def _damage(error: SQLAlchemyError) -> Unusable:
 
 
 def _silent(error: SQLAlchemyError) -> Unusable:
-    return Unusable(f"the database does not answer ({_kind(error)})")
+    state = "accepts no changes" if sqlstate_of(error) == READ_ONLY else "does not answer"
+    return Unusable(f"the database {state} ({_kind(error)})")
 
 
 def storage(folder: Path, min_free_mib: int) -> None:
@@ -88,13 +128,15 @@ def free_bytes(folder: Path) -> int:
 
 
 def broker(settings: Settings) -> None:
-    """Check that the broker answers."""
+    """Check that the broker answers and accepts messages."""
     if "://" not in settings.broker_url:  # for such a URL Celery would use a broker in its own memory
         raise Unusable("the broker's URL cannot be used (expected scheme://...)")
     from workers.broker import app as queue  # Celery takes half a second to import
 
     try:
-        queue.check(settings)
+        queue.check(settings.broker_url)
+    except queue.REFUSED as error:
+        raise Unusable(f"the broker refuses messages ({_refusal(error)})") from error
     except queue.AWAY as error:
         raise Unusable(f"the broker does not answer ({_kind(error)})") from error
     # The text is not a URL, or the library for its scheme is not installed.
@@ -131,6 +173,39 @@ def jobs(catalogue: Catalogue, settings: Settings) -> None:
         raise Unusable(f"jobs wait ({left}), but the workers have taken none for {idle_s:g} s")
 
 
+class Watch:
+    """Runs checks in threads of their own, so that something that hangs holds one thread, and no request.
+
+    A check that still runs is not started again: who asks meanwhile gets its result.
+    """
+
+    def __init__(self) -> None:
+        self._running: dict[str, Future[str]] = {}
+        self._lock = Lock()
+
+    def ask(self, name: str, check: Callable[[], None]) -> Future[str]:
+        """The result of a check, which may come later or never: "ok", or what is wrong."""
+        with self._lock:
+            asked = self._running.get(name)
+            if asked is None or asked.done():
+                asked = self._running[name] = Future()
+                Thread(target=_answer, args=(asked, check), name=f"check of {name}", daemon=True).start()
+            return asked
+
+
+def _answer(asked: Future[str], check: Callable[[], None]) -> None:
+    asked.set_running_or_notify_cancel()  # nobody can cancel it from now on
+    try:
+        check()
+    except Unusable as fault:
+        asked.set_result(str(fault))
+    except BaseException as error:
+        asked.set_exception(error)
+        raise
+    else:
+        asked.set_result(OK)
+
+
 def needed(settings: Settings, catalogue: Catalogue, store: Store) -> dict[str, Callable[[], None]]:
     """The checks that must pass before requests are accepted, by name."""
     checks: dict[str, Callable[[], None]] = {
@@ -154,6 +229,7 @@ _REASONS = {
     r"authentication failed|no password supplied|no pg_hba": "the user or the password is not accepted",
     r'database ".*" does not exist': "there is no database with this name",
     r"timeout|timed out": "no answer within the time limit",
+    r"read-only transaction": "it accepts no changes: expected the primary server; this one only reads",
     r"unable to open|readonly": "the file cannot be opened or written to",
     _DAMAGED: "the file is damaged, or is not an SQLite database",
     r"locked": "the file is locked by another process",
@@ -170,6 +246,18 @@ def database_said(error: SQLAlchemyError) -> str:
     original = getattr(error, "orig", None) or error
     known = (reason for pattern, reason in _REASONS.items() if re.search(pattern, str(original).lower()))
     return next(known, f"it does not answer ({type(original).__name__})")
+
+
+def _refusal(error: Exception) -> str:
+    """Why Redis refuses messages. Its own text may name a user, so it is not shown."""
+    if str(error).startswith("WRONGTYPE"):
+        return "the name of a queue belongs to a key of another type"
+    known = {
+        "OutOfMemoryError": "its memory is full",
+        "ReadOnlyError": "it is a read-only replica",
+        "NoPermissionError": "this user may not write",
+    }
+    return known.get(_kind(error), _kind(error))
 
 
 def _kind(error: BaseException) -> str:

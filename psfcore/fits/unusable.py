@@ -140,22 +140,35 @@ def _blocks_of_zeros(pixels: Pixels, valid: Where) -> Where | None:
     cut = _rows_of_zeros(zero)
     if cut is not None:
         return cut
-    from scipy import ndimage
-
-    blocks = ndimage.binary_opening(zero, np.ones((BLOCK_PX, BLOCK_PX), np.bool_))
-    if not blocks.any():
+    middles = np.zeros(zero.shape, np.bool_)  # of squares of BLOCK_PX zeros
+    columns = zero[:-2] & zero[1:-1] & zero[2:]
+    middles[1:-1, 1:-1] = columns[:, :-2] & columns[:, 1:-1] & columns[:, 2:]
+    if not middles.any():
         return None
+    blocks = _grown(middles, 1)
     box = tuple(
         slice(max(int(at.min()) - BESIDE_PX, 0), int(at.max()) + BESIDE_PX + 1)
         for at in (np.flatnonzero(blocks.any(axis=1 - axis)) for axis in (0, 1))
     )
-    near = ndimage.binary_dilation(blocks[box], np.ones((2 * BESIDE_PX + 1, 1), np.bool_))
-    near = ndimage.binary_dilation(near, np.ones((1, 2 * BESIDE_PX + 1), np.bool_))
-    beside = pixels[box][near & ~blocks[box] & valid[box]]
+    beside = pixels[box][_grown(blocks[box], BESIDE_PX) & ~blocks[box] & valid[box]]
     if beside.size < BLOCK_PX * BESIDE_PX or np.count_nonzero(beside == 0) > ZEROS_BESIDE * beside.size:
         return None
     dark, middle = np.percentile(beside, (5, 50))
     return blocks if dark > DARKEST_BESIDE * middle > 0 else None
+
+
+def _grown(where: Where, reach_px: int) -> Where:
+    """Pixels [y, x] that are at most ``reach_px`` rows and columns away from those of ``where``."""
+    for axis in (0, 1):
+        where, reached = np.swapaxes(where, 0, axis), 0
+        while reached < reach_px:
+            step = min(reached + 1, reach_px - reached)  # no gap is left between the copies, also at edges
+            grown = where.copy()
+            grown[step:] |= where[:-step]
+            grown[:-step] |= where[step:]
+            where, reached = grown, reached + step
+        where = np.swapaxes(where, 0, axis)
+    return where
 
 
 def _rows_of_zeros(zero: Where) -> Where | None:

@@ -136,7 +136,14 @@ def _files_in(
         seconds = SECONDS + size // BYTES_A_SECOND
         try:
             answer = run_limited(
-                copy_files, path, content, pixels=0, seconds=seconds, limits=bounds, start_bytes=start_bytes
+                copy_files,
+                path,
+                content,
+                pixels=0,
+                seconds=seconds,
+                answer_bytes=bounds["max_bytes"] + bounds["max_files"] * (start_bytes or 0),
+                limits=bounds,
+                start_bytes=start_bytes,
             )
         except DataError as error:
             if error.code != "unreadable-pixels":

@@ -11,6 +11,7 @@ from pydantic import Field
 from service.api.jobs import submit_job
 from service.http import files
 from service.http.callers import Reading, Submitting
+from service.http.gate import in_turn
 from service.http.paging import Page, Paging
 from service.http.problems import RESPONSES
 from service.http.state import Shared
@@ -156,7 +157,9 @@ def get_product_changes(product_id: Identity, request: Request, caller: Reading,
     return files.send(request, state.store, digest, "image/png", None, missing=missing)
 
 
-@products.delete("/{product_id}", status_code=204, summary="Delete a product", response_class=Response)
+@in_turn(
+    products.delete("/{product_id}", status_code=204, summary="Delete a product", response_class=Response)
+)
 def delete_product(product_id: Identity, caller: Submitting, state: Shared) -> Response:
     """Remove the product from the catalogue and from your quota. The same request makes it again."""
     row = state.row(ProductRow, product_id, caller.owner)
@@ -199,13 +202,17 @@ def get_product_provenance(
     return _provenance(state, state.row(ProductRow, product_id, caller.owner), "product", format)
 
 
-@lineages.post("/v1/psfs/{psf_id}/rerun", status_code=202, summary="Make a PSF again and compare")
+@in_turn(lineages.post("/v1/psfs/{psf_id}/rerun", status_code=202, summary="Make a PSF again and compare"))
 def rerun_psf(psf_id: Identity, response: Response, caller: Submitting, state: Shared) -> JobView:
     """Submit a job that makes the PSF again with the same parameters. The result is a report on the differences between both PSFs."""
     return _rerun("psf", psf_id, response, caller, state)
 
 
-@lineages.post("/v1/products/{product_id}/rerun", status_code=202, summary="Make a product again and compare")
+@in_turn(
+    lineages.post(
+        "/v1/products/{product_id}/rerun", status_code=202, summary="Make a product again and compare"
+    )
+)
 def rerun_product(product_id: Identity, response: Response, caller: Submitting, state: Shared) -> JobView:
     """Submit a job that makes the product again with the same parameters. The result is a report on the differences between both products."""
     return _rerun("product", product_id, response, caller, state)

@@ -9,6 +9,7 @@ from fastapi import APIRouter, Path, Response
 from pydantic import BaseModel, Field
 
 from service.http.callers import Caller, KeyFirst, Reading, Submitting
+from service.http.gate import in_turn
 from service.http.paging import Page, Paging
 from service.http.problems import RESPONSES, Problem, as_problems, problem
 from service.http.quotas import check_room
@@ -56,16 +57,18 @@ class EstimateView(BaseModel):
     psf: ChosenPsf | None = Field(description="the PSF of a `deconvolve` job; null for other kinds")
 
 
-@router.post(
-    "",
-    status_code=202,
-    summary="Submit a job: a deconvolution, a PSF build, a fit, a cross-validation, a report, a diagnosis or a rerun",
-    responses={
-        200: {
-            "model": JobView,
-            "description": "An identical request was made before; the answer is the job of that request.",
-        }
-    },
+@in_turn(
+    router.post(
+        "",
+        status_code=202,
+        summary="Submit a job: a deconvolution, a PSF build, a fit, a cross-validation, a report, a diagnosis or a rerun",
+        responses={
+            200: {
+                "model": JobView,
+                "description": "An identical request was made before; the answer is the job of that request.",
+            }
+        },
+    )
 )
 def submit_job(body: JobRequest, response: Response, caller: Submitting, state: Shared) -> JobView:
     """Put a job into its queue. If an identical request was made before, the answer is the existing job. If the result of that
@@ -116,7 +119,7 @@ def get_identity(body: JobRequest, caller: Submitting, state: Shared) -> Identif
     return Identified(result_id=identity, parameters=parameters)
 
 
-@estimating.post("", summary="Estimate a job without submitting it")
+@in_turn(estimating.post("", summary="Estimate a job without submitting it"))
 def estimate_job(body: JobRequest, caller: Submitting, state: Shared) -> EstimateView:
     """Estimate a job without starting it. The request and its errors are the same as for `POST /v1/jobs`. The answer
     contains the expected time and memory, the place in the queue and, for a deconvolution, the PSF and the reason for

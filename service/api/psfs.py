@@ -14,6 +14,7 @@ from pydantic import BaseModel, Field
 from psfcore.errors import DataError
 from service.http import files
 from service.http.callers import Caller, Reading, Submitting
+from service.http.gate import in_turn
 from service.http.paging import Page, Paging
 from service.http.problems import RESPONSES, Problem, as_problems, problem
 from service.http.state import Shared
@@ -227,7 +228,7 @@ def get_psf(psf_id: Identity, caller: Reading, state: Shared) -> PsfView:
     return PsfView.of(state.row(PsfRow, psf_id, caller.owner))
 
 
-@router.delete("/{psf_id}", summary="Delete a draft PSF that nothing uses")
+@in_turn(router.delete("/{psf_id}", summary="Delete a draft PSF that nothing uses"))
 def delete_psf(psf_id: Identity, caller: Submitting, state: Shared) -> PsfView:
     """Delete a draft with its files, and return its last description.
 

@@ -22,6 +22,7 @@ from starlette.requests import ClientDisconnect
 from psfcore.files import sha256_of
 from service.http import files
 from service.http.callers import Caller, Submitting
+from service.http.gate import in_turn
 from service.http.problems import RESPONSES, Problem, as_problems
 from service.http.quotas import Allowed, check_length
 from service.http.state import Shared, State
@@ -79,13 +80,15 @@ def tus_options(caller: Submitting, state: Shared) -> Response:
     return Response(status_code=204, headers=headers)
 
 
-@router.post(
-    "",
-    status_code=201,
-    summary="Begin a resumable upload",
-    response_class=Response,
-    openapi_extra=_CREATION,
-    responses={200: {"description": "An upload of the same file is open; the answer is that upload."}},
+@in_turn(
+    router.post(
+        "",
+        status_code=201,
+        summary="Begin a resumable upload",
+        response_class=Response,
+        openapi_extra=_CREATION,
+        responses={200: {"description": "An upload of the same file is open; the answer is that upload."}},
+    )
 )
 def begin_upload(request: Request, caller: Submitting, state: Shared) -> Response:
     """Begin an upload. `Location` is its address; send the bytes there with `PATCH`.
@@ -217,7 +220,10 @@ async def _append(request: Request, file: BinaryIO, upload: PartialUpload, take:
 
 
 def _complete(open_uploads: PartialUploads, upload: PartialUpload, caller: Caller, state: State) -> str:
-    """Check a complete file and add it to the catalogue; returns its address. A file that cannot be used is removed."""
+    """Check a complete file and add it to the catalogue; returns its address.
+
+    A file that cannot be used is removed. If the store or the database is away, the upload stays open.
+    """
     path = open_uploads.path(upload)
     sha256 = sha256_of(path)
     try:
@@ -231,8 +237,10 @@ def _complete(open_uploads: PartialUploads, upload: PartialUpload, caller: Calle
         summary = kind.inspect(path, state)
         row = kind.row(caller.owner, sha256, upload.length, upload.filename, summary)
         Allowed(state, caller).keep(path, sha256, row)
-    finally:
+    except Problem:
         open_uploads.remove(upload)
+        raise
+    open_uploads.remove(upload)
     return f"{kind.address}/{sha256}"
 
 

@@ -44,6 +44,8 @@ PINS = Path(__file__).parents[2] / "constraints.txt"
 CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
 EXTRAS = ("service", "published", "plot")  # the commands need all packages of these extras
 LITTLE_ROOM_BYTES = 5 * 2**30
+# The first patch of each Python that reads long cookies (CVE-2024-7592) and headers of tar files (CVE-2024-6232) in linear time.
+LINEAR_PYTHONS = {(3, 11): 10, (3, 12): 6}
 # The finding and the advice for a database at another revision; "": the advice is that of the schema.
 OTHER_REVISIONS: dict[str, tuple[State, str]] = {
     "empty": ("warning", "the first `heliopsf serve` makes them"),
@@ -85,6 +87,7 @@ def examine(settings: Settings) -> dict[str, Finding]:
     """The finding about each subject, in the order in which problems should be corrected."""
     findings = {
         "versions": versions(),
+        "python": python(),
         "threads": threads(settings),
         "kernels": kernels(),
         "wall": wall(),
@@ -96,13 +99,13 @@ def examine(settings: Settings) -> dict[str, Finding]:
     with _catalogue(settings) as (catalogue, findings["database"]):
         if catalogue is None:
             return findings
-        for check in (schema, clock, workers, stuck_jobs):
+        for check in (schema, changes, clock, workers, stuck_jobs):
             name = check.__name__.replace("_", " ")
             try:
                 findings[name] = check(settings, catalogue)
             except SQLAlchemyError as error:
                 fault = checks.database_said(error)
-                findings[name] = Finding("broken", f"the database did not answer: {fault}")
+                findings[name] = Finding("broken", f"the database: {fault}")
     return findings
 
 
@@ -150,6 +153,20 @@ def versions(pins: Path = PINS) -> Finding:
     kind = "tested" if tested else "required"
     note = "" if tested else " (there is no constraints.txt with tested versions here)"
     return Finding("ok", f"{about}; {count} libraries with {kind} versions{note}")
+
+
+def python(release: tuple[int, int, int] = sys.version_info[:3]) -> Finding:
+    """Does this Python have the corrections against requests and archives that take very long to read?"""
+    *minor, patch = release
+    first = LINEAR_PYTHONS.get((minor[0], minor[1]), 0)
+    here, needed = (".".join(map(str, (*minor, one))) for one in (patch, first))
+    if patch >= first:
+        return Finding("ok", f"Python {here} reads cookies and tar files in linear time")
+    return Finding(
+        "warning",
+        f"Python {here} needs very long for some cookies (CVE-2024-7592) and tar files (CVE-2024-6232)",
+        f"install Python {needed} or later, and heliopsf in it",
+    )
 
 
 def threads(settings: Settings, cpu_quota: Path = CPU_QUOTA) -> Finding:
@@ -203,6 +220,8 @@ def wall() -> Finding:
         " and ".join(text for part, text in parts.items() if acting[part])
         or "has no wall: it reads what this user reads"
     )
+    if not acting["user"]:
+        found += "; it is root, because this machine lets root become no other user"
     if all(acting.values()):
         return Finding("ok", found)
     return Finding(
@@ -250,16 +269,14 @@ def object_store(settings: Settings) -> Finding:
 
 
 def broker(settings: Settings) -> Finding:
-    """Does the broker answer?"""
+    """Does the broker answer and accept messages?"""
     if settings.embedded:
         return Finding("ok", "embedded: a folder inside the data folder")
     where = address(settings.broker_url)
     try:
         checks.broker(settings)
     except checks.Unusable as fault:
-        advice = (
-            "start it, or correct HELIOPSF_BROKER_URL; jobs wait in the database until the broker answers"
-        )
+        advice = "start it, make it accept messages, or correct HELIOPSF_BROKER_URL; jobs wait until then"
         return Finding("broken", f"{where}: {fault}", advice)
     return Finding("ok", f"{where} answers")
 
@@ -279,6 +296,14 @@ def schema(_settings: Settings, catalogue: Catalogue) -> Finding:
         found = f"{revision}, but these are missing: {', '.join((*faults.tables, *faults.indexes))}"
         return Finding("warning", found, "run `heliopsf database upgrade` to restore them")
     return Finding("ok", f"{revision}: tables, columns and indexes are complete")
+
+
+def changes(_settings: Settings, catalogue: Catalogue) -> Finding:
+    """Does the database accept changes?"""
+    if catalogue.schema.faults().tables:
+        return Finding("ok", "nothing to change yet")
+    catalogue.check_writable()
+    return Finding("ok", "the database accepts changes")
 
 
 def clock(_settings: Settings, catalogue: Catalogue) -> Finding:

@@ -84,13 +84,16 @@ def status(data: Path | None) -> None:
 def upgrade(data: Path | None) -> None:
     """Upgrade the tables to the revision of this version, as the next `heliopsf serve` would.
 
-    The command also restores missing tables and indexes. Make a copy of the database first.
+    The command also restores missing tables and indexes. A database of SQLite is copied first, into a file beside it; of
+    PostgreSQL, make a copy yourself.
     """
     with opened_catalogue(data) as catalogue:
         before = catalogue.schema.status()
-        catalogue.upgrade()
+        copy = catalogue.upgrade()
         catalogue.schema.mend()
         now = catalogue.schema.status()
+    if copy is not None:
+        echo(f"the database as it was: {copy}")
     if now != before:
         echo(f"upgraded from {before.revision or 'no revision'} to {now.revision}")
     echo(sentence(now))

@@ -16,14 +16,12 @@ A browser adds the cookie by itself, so a page of another site could try to use 
 
 from __future__ import annotations
 
-import asyncio
 import base64
 import hmac
 import re
 from collections.abc import Callable, Coroutine, Iterable
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, get_type_hints
-from weakref import WeakValueDictionary
 
 from fastapi import Depends, Request, Response, Security
 from fastapi.concurrency import run_in_threadpool
@@ -34,7 +32,7 @@ from fastapi.security.http import HTTPBase
 
 from service.http.guard import BULK, SAFE_METHODS, JsonRequest, cookie_name
 from service.http.problems import Problem, problem
-from service.http.rates import Bucket
+from service.http.rates import Bucket, Turns
 from service.http.state import Shared, State, state_of
 from workers.catalogue.access import OWNER, OWNER_RULE, KeyRefused, Scope, SessionRow
 from workers.catalogue.catalogue import ListedRow
@@ -124,6 +122,7 @@ def admit(request: Request, state: State, scopes: Iterable[str], form_token: str
         request.state.allowance = state.rates.take(bucket, caller.account)
     # Parameters of the path are read after this dependency, so every route gets whole ids.
     _complete_ids(request, state, caller.owner)
+    request.state.admitted()  # set by service.http.guard
     return caller
 
 
@@ -263,7 +262,7 @@ class KeyFirst(APIRoute):
         """The handler of the route. Raises TypeError if the endpoint has no parameter for its caller."""
         handle = super().get_route_handler()
         scopes = _scopes_of(self.endpoint)
-        turns: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
+        turns = Turns()
 
         async def answer(request: Request) -> Response:
             caller = await run_in_threadpool(admit, request, state_of(request), scopes)
@@ -271,7 +270,7 @@ class KeyFirst(APIRoute):
             reading = JsonRequest(request.scope, request.receive)
             if self.path not in BULK or self.methods != {"POST"}:
                 return await handle(reading)
-            async with turns.setdefault(caller.owner, asyncio.Lock()):
+            async with turns.of(caller.owner):
                 return await handle(reading)
 
         return answer

@@ -1,5 +1,7 @@
 """The gate in front of work that takes long for some requests: decodings, inspections, cut-outs, headers, calls of the store.
 
+The work runs in threads of the gate. Those of the pool, in which all other requests are answered, stay free.
+
 Each owner has a queue. A place goes to the owner who holds the fewest places; of several, to the one whose work has taken
 the least time while all of them were here. The time is measured, because what a file declares says little: 65,536 tiles in
 1.5 kB take 15 s. An owner gets a second place only if no other owner waits and one place stays free, so that the first
@@ -12,14 +14,15 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
-from typing import ParamSpec, TypeVar
+from functools import partial, wraps
+from typing import Any, ParamSpec, TypeVar
 
 import anyio
 import anyio.to_thread
 
 P = ParamSpec("P")
 T = TypeVar("T")
+Endpoint = TypeVar("Endpoint", bound=Callable[..., Any])
 
 
 @dataclass
@@ -81,3 +84,20 @@ class Gate:
             queue.since.append(now)
             self._free -= 1
             queue.waiting.popleft().set()
+
+
+def in_turn(register: Callable[[Callable[..., Any]], object]) -> Callable[[Endpoint], Endpoint]:
+    """Register an endpoint that calls the store, such as ``@in_turn(router.get("/{psf_id}"))``: it runs behind the gate ``stored``.
+
+    The endpoint has the parameters ``caller`` and ``state``. Other functions can still call it.
+    """
+
+    def decorate(endpoint: Endpoint) -> Endpoint:
+        @wraps(endpoint)
+        async def run(**given: Any) -> Any:
+            return await given["state"].stored.run(given["caller"].owner, endpoint, **given)
+
+        register(run)
+        return endpoint
+
+    return decorate

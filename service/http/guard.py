@@ -8,15 +8,21 @@ their length before Python 3.11.10 and 3.12.6 (CVE-2024-7592).
 A body costs memory and time before its content is known. Therefore its size is bounded while it arrives, and the values
 in JSON are counted before Python makes objects of these values. The proxy in front of the server bounds the time.
 
+All requests are answered in rounds of one event loop, and each needs several rounds. Therefore the requests with one key begin one
+after the other, and of the bodies of one owner one piece arrives in a round: it stays short if one owner sends very much at once.
+
 Every text of a request is checked by ``check_text``: those of the address and of JSON here, those of forms where the forms
 are read. The interfaces of the Virtual Observatory check theirs themselves, and answer errors in another form.
 """
 
 from __future__ import annotations
 
+import asyncio
 import json
 import re
 from collections.abc import Iterator
+from contextlib import ExitStack
+from functools import partial
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
@@ -27,6 +33,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.http.forms import FORM, URL_ENCODED
 from service.http.problems import FOR_PROGRAMS, SECURITY_HEADERS, AsPage, Problem, answer
+from service.http.rates import Turns
 from service.http.state import Access
 from workers.settings import Settings
 
@@ -43,6 +50,7 @@ UWS_FORMS = re.compile(r"/uws/jobs(/[^/]+/parameters)?")
 MOST_OF = {b"[": 25_000, b"{": 25_000, b":": 25_000, b",": 200_000}
 VO = ("/uws", "/vo/")
 COOKIE_BYTES = 4096
+MOST_ACCOUNTS = 10_000  # of which it is known whose key it is
 SESSION_COOKIE = "heliopsf_session"
 # NUL, which PostgreSQL cannot store, and halves of surrogate pairs, which UTF-8 cannot encode.
 NO_TEXT = re.compile("[\0\ud800-\udfff]")
@@ -56,6 +64,8 @@ def install(app: FastAPI, access: Access, settings: Settings, as_page: AsPage) -
 class _Guard:
     def __init__(self, app: ASGIApp, access: Access, settings: Settings, as_page: AsPage) -> None:
         self._app, self._access, self._settings, self._as_page = app, access, settings, as_page
+        self._begin, self._pieces = Turns(), Turns()
+        self._accounts: dict[int, str] = {}  # by the hash of a key that was good
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -85,11 +95,44 @@ class _Guard:
         if scope["method"] not in SAFE_METHODS:
             receive = self._limited(scope["path"], headers, receive)
         try:
-            await self._app(scope, receive, kept)
+            await self._in_turn(scope, receive, kept)
         finally:
             at_end = scope.get("state", {}).get("at_end")
             if at_end is not None:
                 at_end()
+
+    async def _in_turn(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request as soon as it is the turn of its owner, or of its key if that is new here.
+
+        The turn ends when the request is admitted (``service.http.callers.admit``), reads its body, or has an answer. A request
+        without a key does not wait.
+        """
+        headers, state = Headers(scope=scope), scope.setdefault("state", {})
+        key, turn = hash(headers.get("authorization") or headers.get("cookie")), ExitStack()
+        if "authorization" in headers or "cookie" in headers:
+            lock = self._begin.of(self._accounts.get(key, f"key {key}"))
+            await lock.acquire()
+            turn.callback(lock.release)
+        state["admitted"] = partial(asyncio.get_running_loop().call_soon_threadsafe, turn.close)
+
+        async def in_pieces() -> Message:
+            turn.close()
+            message = await receive()
+            if message.get("body") and "caller" in state:
+                async with self._pieces.of(state["caller"].account):
+                    await asyncio.sleep(0)
+            return message
+
+        async def begun(message: Message) -> None:
+            turn.close()
+            await send(message)
+
+        with turn:
+            await self._app(scope, in_pieces, begun)
+        if "caller" in state:
+            if len(self._accounts) >= MOST_ACCOUNTS:
+                self._accounts.clear()
+            self._accounts[key] = state["caller"].account
 
     def _limited(self, path: str, headers: Headers, receive: Receive) -> Receive:
         """The body of a request, within the limits of the settings. Uploads have limits of their own.

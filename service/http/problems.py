@@ -9,16 +9,17 @@ from http import HTTPStatus
 from typing import Any, cast
 
 from fastapi import FastAPI, Request
+from fastapi.concurrency import run_in_threadpool
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
 from pydantic import BaseModel, ConfigDict, Field
 from pydantic_core import ErrorDetails
-from sqlalchemy.exc import DatabaseError, InterfaceError, OperationalError, SQLAlchemyError
-from sqlalchemy.exc import TimeoutError as PoolTimeoutError
+from sqlalchemy.exc import DatabaseError, SQLAlchemyError
 from starlette.exceptions import HTTPException
 
 from psfcore.errors import DataError
 from workers import checks, logs
+from workers.catalogue.database import is_away
 from workers.contract.suggestions import explained
 from workers.files.store import NO_ROOM, STORAGE_FULL, StoreAway, is_disk_full
 
@@ -44,7 +45,6 @@ STATUS_OF = {
     "file-lost": 410,
     "changed-meanwhile": 409,
     "channel-mismatch": 409,
-    "cutout-not-plain": 409,
     "equal-bulk-open": 409,
     "line-known": 409,
     "name-taken": 409,
@@ -161,7 +161,10 @@ def install(app: FastAPI, as_page: AsPage) -> None:
     """Make the application answer every error as ``answer`` does."""
 
     @app.exception_handler(Problem)
-    def _problem(request: Request, error: Problem) -> Response:
+    async def _problem(request: Request, error: Problem) -> Response:
+        if wants_page(request):
+            return await run_in_threadpool(answer, request, error, as_page)
+        # Without a thread of the pool: /readyz answers although all of them wait.
         return answer(request, error, as_page)
 
     @app.exception_handler(RequestValidationError)
@@ -195,7 +198,8 @@ def install(app: FastAPI, as_page: AsPage) -> None:
         reply = _of_system(error)
         if reply is None:
             raise error  # it is answered as an internal error
-        log.error("%s: %s", "database" if isinstance(error, SQLAlchemyError) else "storage", error)
+        level = logging.WARNING if reply.headers else logging.ERROR  # Retry-After: nothing failed for good
+        log.log(level, "%s: %s", "database" if isinstance(error, SQLAlchemyError) else "storage", error)
         return answer(request, reply, as_page)
 
     @app.exception_handler(Exception)
@@ -217,12 +221,10 @@ def _of_system(error: SQLAlchemyError | OSError) -> Problem | None:
     if isinstance(error, StoreAway):
         detail = "the file storage of the service does not answer; try again in a moment"
         return Problem(503, "storage-away", detail, headers=soon)
-    if isinstance(error, OperationalError | InterfaceError | PoolTimeoutError | OSError) and is_disk_full(
-        error
-    ):
+    if is_disk_full(error):
         return Problem(507, STORAGE_FULL, NO_ROOM)
-    if isinstance(error, OperationalError | InterfaceError | PoolTimeoutError):
-        detail = "the database of the service does not answer; try again in a moment"
+    if is_away(error):
+        detail = "the database of the service does not answer, or accepts no changes; try again in a moment"
         return Problem(503, "database-away", detail, headers=soon)
     if isinstance(error, DatabaseError) and checks.damaged(error):
         detail = "the database of the service is damaged; tell the operator, who must restore a copy"

@@ -7,6 +7,7 @@ an allowance of its own, so that a runaway script does not delay the others.
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import math
 import threading
@@ -15,6 +16,7 @@ from collections import Counter
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
+from weakref import WeakValueDictionary
 
 from limits import RateLimitItem, RateLimitItemPerMinute
 from limits.errors import StorageError
@@ -152,3 +154,14 @@ class AtOnce:
             self._open[who] -= 1
             if not self._open[who]:
                 del self._open[who]
+
+
+class Turns:
+    """Lets the requests of each caller do something one after the other. They wait in the event loop."""
+
+    def __init__(self) -> None:
+        self._turns: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
+
+    def of(self, who: str) -> asyncio.Lock:
+        """The turn of a caller; there is none if nobody holds it or waits for it."""
+        return self._turns.setdefault(who, asyncio.Lock())

@@ -10,6 +10,7 @@ import logging
 import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated
+from weakref import WeakValueDictionary
 
 from fastapi import Depends, Request
 
@@ -21,6 +22,7 @@ from service.http.lookout import Lookout
 from service.http.problems import as_problems
 from service.http.rates import AtOnce, Rates
 from workers.catalogue.catalogue import Catalogue, Row
+from workers.checks import Watch
 from workers.files.store import Store
 from workers.rows import row_of
 from workers.settings import Settings
@@ -91,9 +93,12 @@ class State:
     streams: AtOnce
     requests: AtOnce
     pixels: Gate  # for pixels and whole files: decodings, cut-outs, inspections of uploads
-    stored: Gate  # for headers, and for stored files that are sent
+    stored: Gate  # for headers, and for calls of the store, which may not answer
     planes: Planes
-    lookouts: dict[str, Lookout] = field(default_factory=dict)  # by owner
+    lookouts: WeakValueDictionary[str, Lookout] = field(
+        default_factory=WeakValueDictionary
+    )  # by owner, as long as they have streams
+    watch: Watch = field(default_factory=Watch)
     started_at: float = field(default_factory=time.time)
 
     @property

@@ -25,6 +25,7 @@ from service.api.jobs import EstimateView, estimate_job, submit_job
 from service.api.pixels import picture_of, prepare_image
 from service.http.callers import Caller
 from service.http.files import path_of
+from service.http.gate import in_turn
 from service.http.problems import Problem
 from service.http.quotas import Allowed
 from service.http.state import Shared, State
@@ -92,7 +93,7 @@ async def upload(request: Request, response: Response, caller: PageSubmitting, s
 @router.post("/images/sample")
 async def take_sample(caller: PageSubmitting, state: Shared) -> Response:
     """Add the sample image to the caller's images, and go to its page."""
-    row = await run_in_threadpool(_add_sample, state, caller)
+    row = await state.stored.run(caller.owner, _add_sample, state, caller)
     return RedirectResponse(f"/images/{row.id}", 303)
 
 
@@ -159,7 +160,7 @@ async def picture(image_id: Identity, request: Request, caller: PageReading, sta
     return await picture_of(request, state, caller.owner, image_id)
 
 
-@router.get("/images/{image_id}")
+@in_turn(router.get("/images/{image_id}"))
 def image(image_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
     """The image, its PSF and the estimate for the options in the query."""
     row = state.row(ImageRow, image_id, caller.owner)
@@ -182,7 +183,7 @@ def image(image_id: Identity, request: Request, caller: PageReading, state: Shar
     )
 
 
-@router.get("/images/{image_id}/check")
+@in_turn(router.get("/images/{image_id}/check"))
 def check(image_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
     """The check of the options in the query, for the script of the page."""
     state.row(ImageRow, image_id, caller.owner)
@@ -192,7 +193,7 @@ def check(image_id: Identity, request: Request, caller: PageReading, state: Shar
     )
 
 
-@router.post("/images/{image_id}/start")
+@in_turn(router.post("/images/{image_id}/start"))
 def start(
     image_id: Identity, response: Response, caller: PageSubmitting, state: Shared, form: SentForm
 ) -> Response:
@@ -283,7 +284,7 @@ def _facts(row: ImageRow) -> list[tuple[str, str]]:
 # --- a product ------------------------------------------------------------------------------------------
 
 
-@products.get("")
+@in_turn(products.get(""))
 def product(product_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
     """The product. If its file or the uploaded image is lost or deleted, the page says so."""
     row = state.row(ProductRow, product_id, caller.owner)
@@ -328,14 +329,14 @@ def product(product_id: Identity, request: Request, caller: PageReading, state: 
     return answer
 
 
-@products.post("/rerun")
+@in_turn(products.post("/rerun"))
 def rerun(product_id: Identity, response: Response, caller: PageSubmitting, state: Shared) -> Response:
     """Make the product again, and go to the job."""
     job = rerun_product(product_id, response, caller, state)
     return RedirectResponse(f"/jobs/{job.id}", 303)
 
 
-@products.post("/delete")
+@in_turn(products.post("/delete"))
 def delete(product_id: Identity, caller: PageSubmitting, state: Shared) -> Response:
     """Delete the product, and go to the page of its image, or to the first page if the image was deleted."""
     row = state.row(ProductRow, product_id, caller.owner)

@@ -30,6 +30,7 @@ from service.api.psf_versions import (
 from service.api.psfs import KindOfUpload, delete_psf, get_psf, list_psfs, psf_filter, upload_psf
 from service.http.callers import Caller
 from service.http.files import json_of
+from service.http.gate import in_turn
 from service.http.paging import Cursor, Listing
 from service.http.problems import Problem
 from service.http.state import Shared, State
@@ -100,7 +101,7 @@ async def upload(
     return RedirectResponse(f"/psfs/{view.id}" if image is None else f"/images/{image}?psf_id={view.id}", 303)
 
 
-@router.post("/build")
+@in_turn(router.post("/build"))
 def build(caller: PageSubmitting, state: Shared, form: SentForm) -> Response:
     """Start the build of a PSF from a shipped instrument file, and go to its job."""
     return start_job("psf-build", parameters(PsfBuild, form), caller, state)
@@ -123,7 +124,7 @@ def _wanted(asked: dict[str, str]) -> PsfFilter:
 # --- a PSF ------------------------------------------------------------------------------------------------
 
 
-@router.get("/{psf_id}")
+@in_turn(router.get("/{psf_id}"))
 def psf(psf_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
     """The PSF. Without tables it has no curves; a form then starts the job that makes them."""
     view = get_psf(psf_id, caller, state)
@@ -195,19 +196,19 @@ def change_interpolation(psf_id: Identity, caller: PageCertifying, state: Shared
     return RedirectResponse(f"/psfs/{psf_id}", 303)
 
 
-@router.post("/{psf_id}/tables")
+@in_turn(router.post("/{psf_id}/tables"))
 def make_tables(psf_id: Identity, caller: PageSubmitting, state: Shared) -> Response:
     """Start the job that makes the tables and the picture, and go to it."""
     return start_job("psf-tables", {"psf_id": psf_id}, caller, state)
 
 
-@router.post("/{psf_id}/rerun")
+@in_turn(router.post("/{psf_id}/rerun"))
 def rerun(psf_id: Identity, response: Response, caller: PageSubmitting, state: Shared) -> Response:
     """Make the PSF again, and go to the job."""
     return RedirectResponse(f"/jobs/{rerun_psf(psf_id, response, caller, state).id}", 303)
 
 
-@router.post("/{psf_id}/delete")
+@in_turn(router.post("/{psf_id}/delete"))
 def delete(psf_id: Identity, caller: PageSubmitting, state: Shared) -> Response:
     """Delete a draft that nothing uses, and go to the list."""
     delete_psf(psf_id, caller, state)
@@ -334,7 +335,7 @@ def choose(psf_id: Identity, other: Identity, caller: PageReading) -> Response:
     return RedirectResponse(f"/psfs/{psf_id}/vs/{other}", 303)
 
 
-@router.get("/{psf_id}/vs/{other_id}")
+@in_turn(router.get("/{psf_id}/vs/{other_id}"))
 def comparison(
     psf_id: Identity, other_id: Identity, request: Request, caller: PageReading, state: Shared
 ) -> Response:

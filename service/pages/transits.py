@@ -19,6 +19,7 @@ from markupsafe import Markup
 from psfcore.transit.manifest import MANIFEST_NAME, parse_manifest
 from service.api.transits import get_transit, list_transits, upload_transit
 from service.http.files import KEPT, json_of, not_modified, path_of
+from service.http.gate import in_turn
 from service.http.paging import Cursor, Listing
 from service.http.problems import Problem, as_problems
 from service.http.state import Shared, State
@@ -110,7 +111,7 @@ def transit(transit_id: Identity, request: Request, caller: PageReading, state: 
     )
 
 
-@router.post("/{transit_id}/jobs/{kind}")
+@in_turn(router.post("/{transit_id}/jobs/{kind}"))
 def start(transit_id: Identity, kind: str, caller: PageSubmitting, state: Shared, form: SentForm) -> Response:
     """Start a job on the transit with the options of its form, and go to the job."""
     if kind not in JOBS:
@@ -133,7 +134,7 @@ class StoredPage:
     figures: tuple[bytes, ...]
 
 
-@reports.get("")
+@in_turn(reports.get(""))
 def report(report_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
     """The report. It has the same sections as the HTML page that can be downloaded."""
     row = state.row(ReportRow, report_id, caller.owner)
@@ -154,7 +155,7 @@ def report(report_id: Identity, request: Request, caller: PageReading, state: Sh
     )
 
 
-@reports.get("/figures/{number}")
+@in_turn(reports.get("/figures/{number}"))
 def figure(
     report_id: Identity, number: int, request: Request, caller: PageReading, state: Shared
 ) -> Response:

@@ -13,7 +13,7 @@ from typing import Any, Literal
 from fastapi import APIRouter, Request, Response
 from pydantic import AnyUrl
 
-from service.http.state import Shared
+from service.http.state import Shared, state_of
 from service.operation import faults, states
 from service.vo import jobs
 from service.vo.lists import LINKS_STANDARD
@@ -56,11 +56,12 @@ def _document(what: str) -> dict[str, Any]:
 
 
 @router.get("/availability", summary="VOSI: is the service available?", **_document("the availability"))
-def get_availability(state: Shared) -> Response:
+async def get_availability(request: Request) -> Response:
     """Whether database, storage, and broker or embedded worker answer, and workers take the jobs; a note for each part that does not."""
     from vo_models.vosi.availability import Availability  # half a second, and only this request needs it
 
-    notes = faults(states(state))
+    state = state_of(request)
+    notes = faults(await states(state))
     return _xml(
         Availability(available=not notes, up_since=datetime.fromtimestamp(state.started_at, UTC), note=notes)
     )

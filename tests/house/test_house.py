@@ -127,6 +127,7 @@ LIGHT = (
     "psfcore.fits.stored_psf",
     "psfcore.fits.viewing",  # its modules of pixels are loaded by the first request for pixels
     "psfcore.instruments.files",
+    "psfcore.limited",
     "psfcore.tables.lookup",
     "psfcore.errors",
     "psfcore.noise",

@@ -37,6 +37,8 @@ def work(target: BinaryIO, *, path: str, kind: str) -> dict[str, Any]:
             pass
     if kind == "memory":
         return {"length": len(bytearray(600 * MIB))}
+    if kind == "much":
+        return {"written": os.pwrite(target.fileno(), b"x", 600 * MIB)}
     if kind == "refuse":
         raise HeaderError("bad-card", "expected a card; got none", {"card": "X"})
     if kind == "fault":
@@ -83,6 +85,10 @@ def reached(what: str) -> dict[str, Any]:
             os.chmod(place, 0o666)
         elif name == "owner":
             return {"found": stat.S_ISSOCK(os.fstat(0).st_mode)}
+        elif name == "user":
+            return {"found": [*os.getresuid(), *os.getresgid(), *os.getgroups()]}
+        elif name == "root":
+            os.setresuid(0, 0, 0)
         elif name == "thread":
             threading.Thread(target=lambda: None).start()
     except PermissionError:
@@ -114,7 +120,7 @@ def test_the_answer_and_what_is_written(path: Path, monkeypatch: pytest.MonkeyPa
     assert len({about["process"] for about, _ in several}) == 12
 
 
-@pytest.mark.parametrize("kind", ["crash", "memory", "spin"])
+@pytest.mark.parametrize("kind", ["crash", "memory", "spin", "much"])
 def test_a_child_that_crashes_or_takes_too_much_is_an_error_of_the_file(path: Path, kind: str) -> None:
     with pytest.raises(DataError, match=r"unreadable-pixels: .*crashed, or needed much more memory or time"):
         answer(path, kind)
@@ -171,6 +177,19 @@ def test_the_child_reaches_its_file_and_nothing_else(path: Path) -> None:
     assert answer(path, "wall thread")[0] == {"found": "thread"}, "libraries may start threads"
     assert answer(path, "wall owner")[0] == {"found": False}, "the socket over which other requests come"
     assert path.read_bytes() == b"abc" and not (path.parent / "new").exists()
+
+
+@pytest.mark.skipif(sys.platform != "linux" or os.geteuid() != 0, reason="for a service that runs as root")
+def test_the_child_of_root_is_another_user(path: Path) -> None:
+    """It still reads a file that only root may read."""
+    if not limited.acting(path)["user"]:
+        pytest.skip("this machine lets root become no other user")
+    path.chmod(0o600)
+    path.parent.chmod(0o700)
+    assert answer(path, "read")[1] == b"cba"
+    users = answer(path, "wall user")[0]["found"]
+    assert len(users) == 6 and 0 not in users, "no further groups"
+    assert answer(path, "wall root")[0] == limited.acting(path), "it cannot become root again"
 
 
 def test_what_libraries_do_once_is_done_before_there_is_a_wall(path: Path) -> None:

@@ -1,10 +1,13 @@
-"""Published PSFs: the list, the download from a server on this machine, the hash of the first time, and folders."""
+"""Published PSFs: the list, the download from a server on this machine, servers that answer wrongly, and folders."""
 
 from __future__ import annotations
 
 import hashlib
-import json
+from collections.abc import Callable
+from dataclasses import replace
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 from astropy.io import fits
@@ -12,7 +15,7 @@ from astropy.io import fits
 from psfcore.errors import DataError
 from psfcore.fits.psfs import read_psf
 from psfcore.published_psfs import LIMITS, PUBLISHED, get, kept_file
-from tests.published_server import NAME, published_fits, stand_in
+from tests.published_server import CHECKSUM, NAME, SIZE_PX, answer, published_fits, stand_in
 
 
 def test_the_list_names_each_file_once_and_how_to_cite_it() -> None:
@@ -21,7 +24,10 @@ def test_the_list_names_each_file_once_and_how_to_cite_it() -> None:
     assert len({one.file for one in PUBLISHED.values()}) == len(PUBLISHED) == 17
     for one in PUBLISHED.values():
         assert one.citation and one.place and (one.doi or "SolarSoft" in one.citation)
-        assert all(address.startswith("https://") for address in one.addresses)
+        asked = [*one.addresses, *filter(None, [one.checksum_address])]
+        assert {"https://" + urlsplit(address).netloc for address in asked} <= set(one.origins)
+        assert all(origin.startswith("https://") for origin in one.origins)
+        assert bool(one.addresses) == bool(one.sha256 or one.checksum_address), "a download has a checksum"
 
 
 def test_a_download_is_kept_as_a_psf_that_says_what_it_is(tmp_path: Path) -> None:
@@ -38,49 +44,143 @@ def test_a_download_is_kept_as_a_psf_that_says_what_it_is(tmp_path: Path) -> Non
     assert (psf.name, psf.version, psf.instrument, psf.plate_scale_arcsec) == (NAME, "2025", "aia_193", 0.6)
     assert psf.provenance["doi"] == "10.3847/1538-4365/adbaed"
     sha256 = hashlib.sha256(published_fits()).hexdigest()
-    assert json.loads((tmp_path / f"{NAME}.json").read_bytes())["sha256"] == sha256
     assert f"published_sha256: {sha256}" in "".join(psf.provenance["history"])
-    assert sorted(path.name for path in tmp_path.iterdir()) == [f"{NAME}.fits", f"{NAME}.json"]
+    assert [path.name for path in tmp_path.iterdir()] == [f"{NAME}.fits"]
 
 
 def test_a_broken_download_is_resumed_if_the_server_has_the_same_file(tmp_path: Path) -> None:
-    whole = len(published_fits(200))
-    for again, rest in ((published_fits(200), False), (published_fits(200, total=0.5), True)):
+    content = published_fits(SIZE_PX)
+    whole = len(content)
+    for again, rest in ((content, False), (published_fits(SIZE_PX, total=0.5), True)):
         folder = tmp_path / str(rest)
         with stand_in("/psf") as server:
-            server.files["/psf"] = published_fits(200)
+            server.files["/psf"] = server.published = content
             server.broken = 2  # both tries of the first download
             with pytest.raises(DataError, match="psf-not-downloaded"):
                 get(folder, NAME)
             kept = (folder / f"{NAME}.part").stat().st_size
             assert 0 < kept < whole and server.sent[0] == whole > server.sent[1]
-            server.files["/psf"] = again
-            get(folder, NAME)
+            server.files["/psf"] = server.published = again
+            psf = read_psf(get(folder, NAME), LIMITS)
         assert server.sent[2] == (whole if rest else whole - kept)
-        record = json.loads((folder / f"{NAME}.json").read_bytes())
-        assert record["sha256"] == hashlib.sha256(again).hexdigest()
-        assert sorted(path.name for path in folder.iterdir()) == [f"{NAME}.fits", f"{NAME}.json"]
+        assert f"published_sha256: {hashlib.sha256(again).hexdigest()}" in "".join(psf.provenance["history"])
+        assert [path.name for path in folder.iterdir()] == [f"{NAME}.fits"]
 
 
-def test_another_file_than_the_first_time_is_refused(tmp_path: Path) -> None:
-    with stand_in("/gone", "/psf") as server:
-        kept = get(tmp_path, NAME)
-        assert server.asked == ["/gone", "/gone", "/psf"], "the second address is asked if the first fails"
-        first = kept.read_bytes()
-        kept.unlink()
-        server.files["/psf"] = published_fits(98)
-        with pytest.raises(DataError, match="published-psf-changed"):
-            get(tmp_path, NAME)
-        assert not kept.exists()
-        server.files["/psf"] = published_fits()
-        assert get(tmp_path, NAME).read_bytes() == first
+def test_the_next_address_is_asked_if_one_fails_or_has_another_file(tmp_path: Path) -> None:
+    with stand_in("/gone", "/other", "/psf") as server:
+        server.files["/other"] = published_fits(total=0.5)
+        get(tmp_path, NAME)
+        assert server.asked == ["/gone", "/gone", "/other", "/psf"]
         server.files.clear()
-        kept.unlink()
+        (tmp_path / f"{NAME}.fits").unlink()
         with pytest.raises(DataError, match=rf"psf-not-downloaded.*{server.address}/psf.*404.*--from"):
             get(tmp_path, NAME)
 
 
-def test_a_folder_stands_in_for_the_internet(tmp_path: Path) -> None:
+Fault = Callable[[BaseHTTPRequestHandler], None]
+
+
+def other_bytes(request: BaseHTTPRequestHandler) -> None:
+    answer(request, 200, published_fits(total=0.5))
+
+
+def nothing_yet(request: BaseHTTPRequestHandler) -> None:
+    answer(request, 202)
+
+
+def announces_much(request: BaseHTTPRequestHandler) -> None:
+    answer(request, 200, b"SIMPLE", Content_Length=1000 * SIZE_PX**2)
+
+
+def sends_much(request: BaseHTTPRequestHandler) -> None:
+    """Sends without a length until the client goes away."""
+    answer(request, 200, Content_Length=None, Connection="close")
+    for _ in range(100):
+        request.wfile.write(bytes(8 * SIZE_PX**2))
+
+
+def no_json(request: BaseHTTPRequestHandler) -> None:
+    answer(request, 200, b"<html>sign in</html>")
+
+
+def unknown_checksum(request: BaseHTTPRequestHandler) -> None:
+    answer(request, 200, b'{"data": {"dataFile": {"checksum": {"type": "CRC", "value": "0"}}}}')
+
+
+def to(address: str) -> Fault:
+    return lambda request: answer(request, 302, Location=address)
+
+
+@pytest.mark.parametrize(
+    ("path", "fault", "reason"),
+    [
+        ("/psf", other_bytes, "expected the md5 [0-9a-f]{32}; got"),
+        ("/psf", nothing_yet, "status 202"),
+        ("/psf", announces_much, "more than twice as much"),
+        ("/psf", sends_much, "more than twice as much"),
+        ("/psf", to("/psf"), "at most 5 redirections"),
+        (CHECKSUM, no_json, "expected the checksum of psf_aia_193.fits"),
+        (CHECKSUM, unknown_checksum, "expected the checksum of psf_aia_193.fits"),
+        (CHECKSUM, lambda request: request.send_error(503), "503"),
+    ],
+)
+def test_what_a_server_sends_wrongly_is_not_kept(
+    tmp_path: Path, path: str, fault: Fault, reason: str
+) -> None:
+    with stand_in("/psf") as server:
+        server.faults[path] = fault
+        with pytest.raises(DataError, match=f"psf-not-downloaded.*{reason}"):
+            get(tmp_path, NAME)
+        assert not (tmp_path / f"{NAME}.fits").exists()
+        server.faults.clear()
+        assert get(tmp_path, NAME).is_file()
+
+
+@pytest.mark.parametrize("path", ["/psf", CHECKSUM])
+def test_redirections_stay_at_the_servers_of_the_repository(tmp_path: Path, path: str) -> None:
+    with stand_in("/elsewhere") as other, stand_in("/psf") as server:
+        elsewhere = (other.address + "/elsewhere", "http://127.0.0.1/psf", "https://localhost/psf")
+        for address in (*elsewhere, server.address.replace("//", "//user@") + path, "file:///etc/passwd"):
+            server.faults[path] = to(address)
+            with pytest.raises(
+                DataError, match=f"psf-not-downloaded.*expected an address at {server.address}"
+            ):
+                get(tmp_path, NAME)
+        assert other.asked == []
+        server.faults = {"/psf": to("/file"), CHECKSUM: to(server.address + "/told")}
+        server.files["/file"] = published_fits()
+        told = hashlib.sha256(published_fits()).hexdigest()
+        server.files["/told"] = (
+            b'{"data": {"dataFile": {"checksum": {"type": "SHA-256", "value": "%s"}}}}' % told.encode()
+        )
+        assert get(tmp_path, NAME).is_file()
+
+
+@pytest.mark.parametrize(
+    "extent",
+    ["bytes 0-9/10", "bytes 7-{last}/{size}", "bytes {first}-{last}/*", "items {first}-{last}/{size}", ""],
+)
+def test_a_rest_that_is_another_part_is_not_appended(tmp_path: Path, extent: str) -> None:
+    content = published_fits(SIZE_PX)
+    with stand_in("/psf") as server:
+        server.files["/psf"] = server.published = content
+        server.broken = 2
+        with pytest.raises(DataError, match="psf-not-downloaded"):
+            get(tmp_path, NAME)
+
+        def wrong(request: BaseHTTPRequestHandler) -> None:
+            first = int(request.headers["Range"][len("bytes=") : -1])
+            told = extent.format(first=first, last=len(content) - 1, size=len(content))
+            del server.faults["/psf"]
+            answer(request, 206, content[first:], Content_Range=told)
+
+        server.faults["/psf"] = wrong
+        assert get(tmp_path, NAME).is_file()
+        assert server.sent[-1] == len(content), "the whole file was asked for again"
+
+
+def test_a_folder_stands_in_for_the_internet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     name, folder = "euvi_171_b_2012", tmp_path / "usb"
     with pytest.raises(DataError, match=f"psf-not-fetched.*heliopsf psf get {name}"):
         kept_file(tmp_path, name)
@@ -95,8 +195,14 @@ def test_a_folder_stands_in_for_the_internet(tmp_path: Path) -> None:
     assert "divided_by: the sum of the published weights, 3" in "".join(psf.provenance["history"])
     assert psf.cards == {"OBSRVTRY": "STEREO_B", "DETECTOR": "EUVI"}
     (folder / PUBLISHED[name].file).write_bytes(b"<html>not found</html>")
-    (tmp_path / f"{name}.json").unlink()
     with pytest.raises(DataError, match="not-fits"):
         get(tmp_path, name, source=folder)
+    xrt = "xrt_560ev_2017"
+    (folder / PUBLISHED[xrt].file).write_bytes(published_fits())
+    with pytest.raises(DataError, match=f"published-psf-changed.*{PUBLISHED[xrt].sha256}"):
+        get(tmp_path, xrt, source=folder)
+    here = replace(PUBLISHED[xrt], sha256=hashlib.sha256(published_fits()).hexdigest())
+    monkeypatch.setitem(PUBLISHED, xrt, here)
+    assert get(tmp_path, xrt, source=folder).is_file()
     with pytest.raises(DataError, match=r"unknown-published-psf.*aia_193_2025"):
         get(tmp_path, "aia_193_2052")

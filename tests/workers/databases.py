@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import pytest
-from sqlalchemy import Executable
+from sqlalchemy import Executable, create_engine, text
 
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.database import Database
@@ -36,3 +38,22 @@ def add(catalogue: Catalogue, *new: Any) -> None:
     """Insert rows as they are, without counting their bytes."""
     with database(catalogue).writing.begin() as session:
         session.add_all(new)
+
+
+@contextmanager
+def reading_only(catalogue: Catalogue) -> Iterator[None]:
+    """PostgreSQL accepts no changes, as a standby does. Connections that the catalogue has open are closed."""
+    url = database(catalogue).engine.url
+    admin = create_engine(url.set(database="postgres"), isolation_level="AUTOCOMMIT")
+
+    def change(statement: str) -> None:
+        with admin.connect() as connection:
+            connection.execute(text(f"ALTER DATABASE {url.database} {statement}"))
+        catalogue.close()
+
+    change("SET default_transaction_read_only = on")
+    try:
+        yield
+    finally:
+        change("RESET default_transaction_read_only")
+        admin.dispose()

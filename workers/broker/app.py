@@ -14,7 +14,8 @@ from celery import Celery
 from kombu import Connection
 from kombu import Queue as BrokerQueue
 from kombu.exceptions import KombuError, OperationalError
-from redis.exceptions import RedisError
+from kombu.transport import redis
+from redis.exceptions import RedisError, ResponseError
 
 from workers.contract.jobs import Queue, broker_name
 from workers.settings import Settings
@@ -25,6 +26,8 @@ PROCESS_START_S = (
     120.0  # on a busy machine; Celery's default of 4 s would end every new process again and again
 )
 AWAY = (OperationalError, KombuError, RedisError, OSError)
+REFUSED = ResponseError  # one of AWAY: Redis answers, but accepts no messages
+NO_MESSAGE = "no message is like this one"
 log = logging.getLogger(__name__)
 
 
@@ -47,6 +50,9 @@ def make_app(settings: Settings) -> Celery:
         task_queues=[BrokerQueue(broker_name(queue), routing_key=broker_name(queue)) for queue in Queue],
         task_default_queue=broker_name(Queue.INTERACTIVE),
         broker_connection_retry_on_startup=True,
+        # A Redis that refuses commands counts as lost, and PatientConsumer waits for it; by default the worker ends.
+        broker_channel_error_retry=True,
+        worker_consumer="workers.broker.order:PatientConsumer",
         worker_hijack_root_logger=False,
         worker_send_task_events=False,
         # Its commands need no key: whoever writes to the broker could stop the workers or make them deaf.
@@ -77,19 +83,25 @@ def call_for_help(app: Celery, job_id: str, workers: int) -> None:
         log.warning("the broker does not answer, job %s continues without help: %s", job_id, error)
 
 
-def check(settings: Settings) -> None:
-    """Raise an error if the broker does not answer within seconds. Do not call it for the embedded broker.
+def check(url: str) -> None:
+    """Raise an error if the broker does not answer within seconds or accepts no messages. Not for the embedded broker.
 
     The error is one of ``AWAY``; for a bad URL it is the error of the transport library.
     """
     options = {"socket_connect_timeout": 2, "socket_timeout": 2}
-    with Connection(settings.broker_url, transport_options=options, connect_timeout=2) as connection:
+    with Connection(url, transport_options=options, connect_timeout=2) as connection:
         connection.ensure_connection(max_retries=1, interval_start=0, timeout=3)
+        channel = connection.default_channel
+        if isinstance(channel, redis.Channel):
+            for queue in Queue:
+                # Redis refuses this command for every reason for which it refuses a message. The command inserts
+                # nothing, because no message of the queue is like NO_MESSAGE.
+                channel.client.linsert(broker_name(queue), "BEFORE", NO_MESSAGE, "")
 
 
 def _transport_options(settings: Settings) -> dict[str, Any]:
     if not settings.embedded:
-        patience = {"socket_connect_timeout": 5, "socket_timeout": 30}
+        patience = {"socket_connect_timeout": 5, "socket_timeout": 10}
         return {**patience, "queue_order_strategy": "workers.broker.order:MostUrgentFirst"}
     broker = settings.data_dir.resolve() / "broker"
     queue, control = broker / "queue", broker / "control"

@@ -24,16 +24,18 @@ from typing import Any
 
 from celery import bootsteps
 from celery.worker import state
+from celery.worker.consumer import Consumer
 from kombu.exceptions import ChannelError
 from kombu.transport import filesystem, redis
 from kombu.utils.json import dumps
 from kombu.utils.scheduling import FairCycle, priority_cycle
 
 from psfcore.files import write_whole
-from workers.broker.app import ASSIST, RUN_JOB
+from workers.broker.app import ASSIST, AWAY, RUN_JOB, check
 from workers.contract.jobs import broker_name, by_urgency, queue_of_broker
 
 log = logging.getLogger(__name__)
+WAIT_S = 2.0  # time after which a broker that is away is asked again
 
 
 class MostUrgentFirst(priority_cycle):
@@ -189,6 +191,28 @@ class FolderTransport(filesystem.Transport):
                 if until is not None and time.monotonic() >= until:
                     raise TimeoutError from None
             time.sleep(self.polling_interval)
+
+
+class PatientConsumer(Consumer):
+    """The part of a worker that takes messages. It waits for a broker that is away or accepts no messages.
+
+    Celery itself ends the worker after 100 attempts.
+    """
+
+    def connect(self) -> Any:
+        """The connection, once the broker accepts messages. Raises ``WorkerShutdown`` if the worker must stop."""
+        told = ""
+        while self.app.conf.broker_transport is None:  # the folder of the embedded mode needs no server
+            state.maybe_shutdown()
+            try:
+                check(self.app.conf.broker_url)
+                break
+            except AWAY as error:
+                if str(error) != told:
+                    told = str(error)
+                    log.warning("waiting for the broker (%s): %s", type(error).__name__, told)
+                time.sleep(WAIT_S)
+        return super().connect()
 
 
 class TakeWhatCanStart(bootsteps.StartStopStep):

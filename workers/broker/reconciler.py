@@ -8,6 +8,8 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from celery import Celery
 from sqlalchemy.exc import SQLAlchemyError
@@ -23,6 +25,7 @@ log = logging.getLogger(__name__)
 # This number is small: an urgent job may arrive while jobs are submitted, and must not wait for many other
 # jobs.
 AT_ONCE = 50
+ALIVE_S = 30.0
 SETTLE_EVERY_S = 60.0
 RETAIN_EVERY_S = 3600.0
 
@@ -55,27 +58,30 @@ def reconcile(catalogue: Catalogue, app: Celery, settings: Settings) -> int:
 class Reconciler:
     """A thread that reconciles every ``settings.reconcile_s`` seconds, and immediately after ``wake``.
 
-    Once a minute it also deletes the files of ``store`` that were removed, and temporary files of ended processes. Once an
-    hour it deletes what is older than the operator keeps it.
+    A second thread cares for the files of ``store``, which may take long. Once a minute it deletes files that were
+    removed, and temporary files of ended processes. Once an hour it deletes what is older than the operator keeps it.
     """
 
     def __init__(self, catalogue: Catalogue, store: Store, app: Celery, settings: Settings) -> None:
         self._catalogue, self._store, self._app, self._settings = catalogue, store, app, settings
-        self._settled_at = time.monotonic()
-        self._retained_at = -RETAIN_EVERY_S
-        self._wake = threading.Event()
-        self._stopping = False
-        self._thread = threading.Thread(target=self._loop, name="reconciler", daemon=True)
+        self._ended_at = time.monotonic()
+        self._wake, self._stopping = threading.Event(), threading.Event()
+        self._threads = (
+            threading.Thread(target=self._reconcile, name="reconciler", daemon=True),
+            threading.Thread(target=self._keep_house, name="housekeeping", daemon=True),
+        )
 
     def start(self) -> None:
-        """Start the thread."""
-        self._thread.start()
+        """Start the threads."""
+        for thread in self._threads:
+            thread.start()
 
     def stop(self) -> None:
-        """Stop the thread and wait for it."""
-        self._stopping = True
+        """Stop the threads, and wait for them for ``settings.stop_s`` seconds each."""
+        self._stopping.set()
         self._wake.set()
-        self._thread.join()
+        for thread in self._threads:
+            thread.join(self._settings.stop_s)
 
     def wake(self) -> None:
         """Reconcile now, without waiting for the interval to end, because there is a job to submit."""
@@ -83,26 +89,39 @@ class Reconciler:
 
     @property
     def alive(self) -> bool:
-        """True while the thread runs."""
-        return self._thread.is_alive()
+        """True if a round of the reconciler succeeded in the last ``ALIVE_S`` seconds (longer, if rounds are rarer)."""
+        return time.monotonic() - self._ended_at < max(ALIVE_S, 3 * self._settings.reconcile_s)
 
-    def _loop(self) -> None:
-        while not self._stopping:
+    def _reconcile(self) -> None:
+        while not self._stopping.is_set():
             self._wake.clear()
             submitted = 0
-            try:
+            with _trying_again("reconciler"):
                 submitted = reconcile(self._catalogue, self._app, self._settings)
-                if time.monotonic() - self._settled_at > SETTLE_EVERY_S:
-                    self._settled_at = time.monotonic()
-                    self._store.sweep()
-                    settle_old(self._catalogue, self._store)
-                if time.monotonic() - self._retained_at > RETAIN_EVERY_S:
-                    self._retained_at = time.monotonic()
-                    retain(self._catalogue, self._store, self._settings)
-            except SQLAlchemyError as error:
-                # The database may be restarting; the thread tries again after the interval.
-                log.warning("reconciler: the database does not answer: %s", error)
-            except OSError as error:
-                log.warning("reconciler: the store does not answer: %s", error)
+                self._ended_at = time.monotonic()
             if submitted < AT_ONCE:
                 self._wake.wait(self._settings.reconcile_s)
+
+    def _keep_house(self) -> None:
+        retained_at = -RETAIN_EVERY_S
+        while True:
+            if time.monotonic() - retained_at > RETAIN_EVERY_S:
+                retained_at = time.monotonic()
+                with _trying_again("retention"):
+                    retain(self._catalogue, self._store, self._settings)
+            if self._stopping.wait(SETTLE_EVERY_S):
+                return
+            with _trying_again("housekeeping"):
+                self._store.sweep()
+                settle_old(self._catalogue, self._store)
+
+
+@contextmanager
+def _trying_again(what: str) -> Iterator[None]:
+    """Log that the database or the store cannot be used now. The thread goes on, and does its work later."""
+    try:
+        yield
+    except SQLAlchemyError as error:
+        log.warning("%s: the database does not answer: %s", what, error)
+    except OSError as error:
+        log.warning("%s: the store does not answer: %s", what, error)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+import logging
 import re
 import secrets
 import time
@@ -19,12 +20,14 @@ from collections.abc import Collection, Sequence
 from enum import StrEnum
 
 from sqlalchemy import ColumnElement, Select, String, delete, func, or_, select, update
+from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from workers.catalogue.database import Database, Queries, newest_first
+from workers.catalogue.database import Database, Queries, is_away, newest_first
 from workers.catalogue.owners import lock_owner
 from workers.catalogue.tables import Base, KeyRow
 
+log = logging.getLogger(__name__)
 OWNER = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}")
 OWNER_RULE = "1 to 64 characters: lower-case letters, digits, '.', '_' and '-'; the first character is a letter or a digit"
 LABEL_LENGTH = 80
@@ -134,7 +137,13 @@ class Keys(Queries):
         if row.last_used_at is None or row.last_used_at < now - _USE_NOTED_EVERY_S:
             unnoted = or_(KeyRow.last_used_at.is_(None), KeyRow.last_used_at < now - _USE_NOTED_EVERY_S)
             use = update(KeyRow).where(KeyRow.id == row.id, unnoted)
-            self._database.change(use.values(last_used_at=now))
+            try:
+                self._database.change(use.values(last_used_at=now))
+            except SQLAlchemyError as error:
+                if not is_away(error):
+                    raise
+                # A database that only reads can still answer this request.
+                log.warning("could not record the use of key %s: %s", row.id, str(error).split("\n")[0])
 
     def get(self, identity: str) -> KeyRow | None:
         """The row of a key, valid or not; None if there is no key with this id."""

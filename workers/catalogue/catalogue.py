@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Collection, Iterator, Sequence
+from pathlib import Path
 from typing import Any, TypeVar
 
-from sqlalchemy import Select, String, cast, create_engine, select
+from sqlalchemy import Select, String, cast, create_engine, false, select, update
 from sqlalchemy.exc import DatabaseError, IntegrityError
 from sqlalchemy.orm import Session
 from sqlalchemy.pool import NullPool
@@ -38,6 +39,7 @@ from workers.catalogue.tables import (
     ReportRow,
     SolutionRow,
     TransitRow,
+    WorkerRow,
 )
 from workers.catalogue.uws_jobs import UwsJobs
 from workers.catalogue.waiting import Places, Turns
@@ -83,9 +85,12 @@ class Catalogue:
         self.owners = Owners(self._database)
         self.named_files = NamedFiles(self._database)
 
-    def upgrade(self) -> None:
-        """Upgrade the tables of the database to this version. Raises ``workers.catalogue.schema.SchemaError``."""
-        self.schema.upgrade()
+    def upgrade(self) -> Path | None:
+        """Upgrade the tables of the database to this version. Raises ``workers.catalogue.schema.SchemaError``.
+
+        Returns the copy that was made before; see ``Schema.upgrade``.
+        """
+        return self.schema.upgrade()
 
     def close(self) -> None:
         """Close all connections."""
@@ -94,6 +99,10 @@ class Catalogue:
     def ping(self) -> None:
         """Raise ``sqlalchemy.exc.SQLAlchemyError`` if the database does not answer."""
         self._database.clock()
+
+    def check_writable(self) -> None:
+        """Raise ``sqlalchemy.exc.SQLAlchemyError`` if the database refuses changes. Changes nothing."""
+        self._database.change(update(WorkerRow).where(false()).values(version=""))
 
     def check_pages(self) -> None:
         """Raise ``sqlalchemy.exc.DatabaseError`` if the file of an SQLite database is damaged.

@@ -6,6 +6,7 @@ import json
 import sqlite3
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, TypeVar
 
 from sqlalchemy import (
@@ -24,11 +25,17 @@ from sqlalchemy import (
 )
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import CursorResult
+from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
+from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from sqlalchemy.orm import InstrumentedAttribute, Session, sessionmaker
 
 from psfcore.errors import DataError
 
 PATIENCE_S = 30.0  # longest time to wait for other writers of SQLite
+READ_ONLY = "25006"  # sqlstate of a change in a database that only reads, such as a standby
+# Classes of sqlstates: a lost connection, a transaction that must be run again, no resources, the operator's
+# intervention (a shutdown, a start, a limit on time), and errors of the system below PostgreSQL.
+_AWAY = frozenset({"08", "40", "53", "57", "58"})
 Row = TypeVar("Row")
 Value = TypeVar("Value")
 Query = TypeVar("Query", bound=Select[*tuple[Any, ...]])
@@ -48,6 +55,12 @@ class Database:
     def sqlite(self) -> bool:
         """Whether the database is SQLite."""
         return self.engine.dialect.name == "sqlite"
+
+    @property
+    def file(self) -> Path | None:
+        """The file of an SQLite database; None if the database has no file."""
+        name = self.engine.url.database
+        return Path(name) if self.sqlite and name and name != ":memory:" else None
 
     @property
     def now(self) -> ColumnElement[float]:
@@ -107,6 +120,27 @@ class Queries:
         self._database = database
 
 
+def sqlstate_of(error: BaseException) -> str | None:
+    """The code by which PostgreSQL names the cause of an error; None if there is no code."""
+    return getattr(getattr(error, "orig", None), "sqlstate", None)
+
+
+def is_away(error: BaseException) -> bool:
+    """Whether an error says that the database could not do its work now, so that the same call may succeed later.
+
+    The error then tells nothing about the rows. PostgreSQL names the cause in the sqlstate. Without one, nobody
+    answered, or the database is SQLite.
+    """
+    if isinstance(error, PoolTimeoutError):
+        return True
+    if not isinstance(error, DBAPIError):
+        return False
+    sqlstate = sqlstate_of(error)
+    if sqlstate is None:
+        return isinstance(error, OperationalError | InterfaceError)
+    return sqlstate == READ_ONLY or sqlstate[:2] in _AWAY
+
+
 def newest_first(query: Query, table: Any, limit: int, after: tuple[float, str] | None = None) -> Query:
     """A page of a query for rows of a table, newest first.
 
@@ -140,10 +174,12 @@ def several_ids_fit(digits: str, candidates: Sequence[str]) -> DataError:
 
 def open_engine(url: str) -> Engine:
     """Make an engine, with the settings that the database needs for many small concurrent writers."""
+    if url.startswith("postgresql"):
+        from workers.catalogue.postgres import open_postgres  # SQLite needs no psycopg
+
+        return open_postgres(url, json_serializer=strict_json)
     if not url.startswith("sqlite"):
-        # Without a limit, a request to an unreachable database would wait for minutes.
-        patience = {"connect_timeout": 5} if url.startswith("postgresql") else {}
-        return create_engine(url, pool_pre_ping=True, connect_args=patience, json_serializer=strict_json)
+        return create_engine(url, pool_pre_ping=True, json_serializer=strict_json)
     engine = create_engine(url, connect_args={"timeout": PATIENCE_S}, json_serializer=strict_json)
 
     @event.listens_for(engine, "connect")

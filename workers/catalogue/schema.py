@@ -10,7 +10,10 @@ upgrades the tables in one transaction. The others wait, and then find that it i
 from __future__ import annotations
 
 import logging
+import os
+import sqlite3
 import threading
+import time
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -88,17 +91,21 @@ class Schema:
         self._database = database
         self._revisions = revisions
 
-    def upgrade(self) -> None:
+    def upgrade(self) -> Path | None:
         """Make the tables of an empty database, or upgrade a database that has an older revision.
 
-        Raises ``SchemaError`` if the database belongs to a later version or to a development version that cannot be
-        upgraded, or if its tables are not those of heliopsf.
+        Before an upgrade, a database in a file of SQLite is copied, because older versions cannot read the new tables.
+        Returns the copy; None if there was nothing to copy. Raises ``SchemaError`` if the database belongs to a later
+        version or to a development version that cannot be upgraded, if its tables are not those of heliopsf, or if it
+        cannot be copied.
         """
         from alembic import command
 
         if self.status().state == "current":
-            return
-        with _ONE_AT_A_TIME, self._database.engine.begin() as connection:
+            return None
+        copy = None
+        unhurried = self._database.engine.execution_options(unhurried=True)
+        with _ONE_AT_A_TIME, unhurried.begin() as connection:
             if not self._database.sqlite:  # on SQLite the transaction already holds the write lock
                 connection.execute(text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": LOCK})
             status = self._status(connection)
@@ -110,11 +117,15 @@ class Schema:
                 Base.metadata.create_all(connection)
                 command.stamp(config, "head")
             else:
+                if status.state == "older" and self._database.file is not None:
+                    copy = _copy(self._database.file, f"revision-{status.revision}")
                 command.upgrade(config, "head")  # does nothing if another process has upgraded the database
         if status.state == "empty":
             log.info("database: created, revision %s", status.wanted)
         elif status.state == "older":
-            log.info("database: upgraded from %s to %s", status.revision, status.wanted)
+            before = "" if copy is None else f"; the database as it was: {copy}"
+            log.info("database: upgraded from %s to %s%s", status.revision, status.wanted, before)
+        return copy
 
     def check(self) -> None:
         """Raise ``SchemaError`` if the database is not at the revision of this version. The message says what to do."""
@@ -130,7 +141,7 @@ class Schema:
 
     def mend(self) -> None:
         """Create the missing tables and indexes of a database that is at the revision of this version."""
-        with self._database.engine.begin() as connection:
+        with self._database.engine.execution_options(unhurried=True).begin() as connection:
             Base.metadata.create_all(connection)
             for table in Base.metadata.sorted_tables:
                 for index in table.indexes:
@@ -161,6 +172,32 @@ class Schema:
         else:
             state = "newer" if revision > wanted else "obsolete"
         return SchemaStatus(revision, wanted, state)
+
+
+def _copy(file: Path, what: str) -> Path:
+    """Copy a database of SQLite to a new file beside it, as it was before the transaction that holds the write lock.
+
+    Raises ``SchemaError``; there is then no copy.
+    """
+    copy = file.with_name(f"{file.stem}.{what}.{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}{file.suffix}")
+    partial = copy.with_name(f"{copy.name}.partial")
+    partial.unlink(missing_ok=True)
+    source = sqlite3.connect(file)
+    try:
+        partial.touch(mode=0o600)
+        source.execute("VACUUM INTO ?", (str(partial),))
+        with partial.open("rb") as written:
+            os.fsync(written.fileno())
+        partial.replace(copy)
+    except (sqlite3.Error, OSError) as error:
+        partial.unlink(missing_ok=True)
+        raise SchemaError(
+            f"expected to copy the database to {copy} before its upgrade; got: {error}: make room there, or let this "
+            "user write there; the database is as it was"
+        ) from error
+    finally:
+        source.close()
+    return copy
 
 
 def _config(revisions: Path) -> Config:

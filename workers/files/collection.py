@@ -21,7 +21,7 @@ from psfcore.errors import DataError
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.owners import KEPT, UPLOADED, WITH_FILES, FileRow
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, ReportRow, SolutionRow, TransitRow
-from workers.files.store import Blob, FileState, Store
+from workers.files.store import Blob, FileState, Store, StoreAway
 from workers.settings import Settings
 
 log = logging.getLogger(__name__)
@@ -171,28 +171,34 @@ def collect(
 def remove_unnamed(catalogue: Catalogue, store: Store, digests: Iterable[str]) -> None:
     """Move these files aside, except the files to which a row of any owner refers (``NamedFiles.among``).
 
-    ``settle`` deletes them later.
+    ``settle`` deletes them later. While the store is away, they stay; then only ``collect`` removes them.
     """
     wanted = frozenset(digests)
     before = time.time()
     for digest in wanted - catalogue.named_files.among(wanted):
-        store.remove(digest, before)
+        try:
+            store.remove(digest, before)
+        except StoreAway as away:  # the row is deleted already, so the request must not fail
+            log.warning("file %s stays until `heliopsf store collect`: %s", digest, away)
 
 
 def settle(catalogue: Catalogue, store: Store, digests: set[str]) -> set[str]:
     """Bring back those of the files moved aside to which a row refers, and delete the others.
 
-    A file to which a row refers is deleted aside only after the store shows it in its place: that it was not brought back may also
-    mean that the store could not find it for a moment. Returns the hashes of the files that were brought back. If this is interrupted,
-    the next call finds the files.
+    A file to which a row refers is deleted aside only after the store shows it in its place. Returns the hashes of the
+    files that were brought back. If this is interrupted, the next call finds the files that are left. Raises ``StoreAway``.
     """
     if not digests:
         return set()
     named = digests.intersection(catalogue.named_files.all())
-    back = {digest for digest in named if store.bring_back(digest)}
+    back = set()
     for digest in digests:
-        if digest not in named or store.kept_at(digest) is not None:
-            store.delete_aside(digest)
+        if digest in named:
+            if store.bring_back(digest):
+                back.add(digest)
+            if store.kept_at(digest) is None:
+                continue
+        store.delete_aside(digest)
     return back
 
 

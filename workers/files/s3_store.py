@@ -2,6 +2,10 @@
 
 S3 shows an object only when its upload is complete, so an existing object is complete. Credentials, region and endpoint
 come from the usual environment variables (``AWS_*``).
+
+A 404 does not prove that an object is absent: a bucket that is not found during a failover, or another server at the
+endpoint, answers the same. An object is absent if a listing of the bucket does not contain it. Everything else is
+``StoreAway``: it could not be found out now.
 """
 
 from __future__ import annotations
@@ -11,12 +15,16 @@ import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import aiohttp
 import s3fs
-from botocore.exceptions import BotoCoreError
+from botocore.exceptions import BotoCoreError, ClientError, ConnectTimeoutError, ReadTimeoutError
+from botocore.exceptions import ConnectionError as NotConnected
+from botocore.parsers import ResponseParserError
+from s3fs.core import set_custom_error_handler
 
 from psfcore.files import sha256_of
 from workers.files.store import DAMAGED, BadFile, Blob, Store, StoreAway, is_disk_full, sync
@@ -24,23 +32,63 @@ from workers.files.store import DAMAGED, BadFile, Blob, Store, StoreAway, is_dis
 LOOK_AFTER_S = 10.0  # shortest time between two measurements of the size of the copies
 IN_USE_S = 60.0  # a copy that was requested in the last minute is not removed: it may be opened soon
 FILL = 0.8  # copies are removed until all copies together are smaller than this fraction of the allowed size
-RETRIES = 3  # number of times that a request is repeated after a transient failure, about once a second
+CONNECT_S = 5.0  # longest time until the store accepts a connection
+PROBE_S = 4.0  # longest time of ``check``, shorter than ``workers.checks.CHECK_S``
+SILENT = (ReadTimeoutError, ConnectTimeoutError, TimeoutError)
+
+
+@dataclass(frozen=True)
+class Patience:
+    """How long a call waits for the store.
+
+    silence_s: longest time until the next byte of an answer. tries: how many times a request is sent if it fails. pause_s:
+    after a call that got no answer, all calls fail at once for this time.
+    """
+
+    silence_s: float
+    tries: int
+    pause_s: float
+
+
+# The calls of a worker must end long before ``collection.SETTLED_AFTER_S``: until then, a file that was moved aside can come back.
+WORKER = Patience(silence_s=30.0, tries=3, pause_s=0.0)
+REQUEST = Patience(silence_s=10.0, tries=2, pause_s=5.0)
+
+
+def _is_worth_repeating(error: Exception) -> bool:
+    """Whether to repeat a request, beside the errors for which s3fs does so itself: silence and answers that were cut."""
+    if isinstance(error, ClientError):
+        return bool(error.response.get("ResponseMetadata", {}).get("HTTPStatusCode", 0) >= 500)
+    return isinstance(error, NotConnected)
+
+
+set_custom_error_handler(_is_worth_repeating)
 
 
 class RemoteStore(Store):
     """Objects below a prefix of a bucket, named by the hash of their content. Readers get copies in the local folder."""
 
-    def __init__(self, url: str, folder: Path, max_copies_bytes: int) -> None:
+    def __init__(
+        self, url: str, folder: Path, max_copies_bytes: int, *, within_requests: bool = False
+    ) -> None:
         super().__init__(folder, blobs="copies")
         self._root = url.removeprefix("s3://").rstrip("/")
         self._max_copies_bytes = max_copies_bytes
         self._counted_at = 0.0
-        # Listings are not cached, because objects of other processes must be visible at once.
+        self._patience = REQUEST if within_requests else WORKER
+        self._silent_until = -math.inf
+        # Listings are not cached, because objects of other processes must be visible at once. s3fs repeats requests, and
+        # downloads from where they were cut; if botocore repeated them too, the numbers of tries would multiply.
         self._s3: Any = s3fs.S3FileSystem(
             use_listings_cache=False,
             skip_instance_cache=True,
-            config_kwargs={"connect_timeout": 5, "read_timeout": 60, "retries": {"max_attempts": RETRIES}},
+            config_kwargs={
+                "connect_timeout": CONNECT_S,
+                "read_timeout": self._patience.silence_s,
+                "retries": {"max_attempts": 0},
+            },
         )
+        self._s3.retries = self._patience.tries
 
     def path(self, digest: str) -> Path:
         """A local copy of the file with this SHA-256, downloaded if missing. Raises ``StoreAway``, FileNotFoundError."""
@@ -54,9 +102,11 @@ class RemoteStore(Store):
     def size(self, digest: str) -> int | None:
         """The size of the file with this SHA-256, bytes; None if the store has no such file. Raises ``StoreAway``."""
         there = self._about(digest)
-        if there is None and self.bring_back(digest):
+        if there is None:
+            self.bring_back(digest)
+            # Look again in any case: another process may have brought it back.
             there = self._about(digest)
-        return None if there is None else int(there["size"])
+        return None if there is None else there.bytes
 
     def _content_sha256(self, digest: str) -> str:
         """SHA-256 of the object itself.
@@ -79,28 +129,29 @@ class RemoteStore(Store):
 
     def set_aside(self, digest: str) -> bool:
         """As ``Store.set_aside``, below the prefix ``damaged`` of the bucket. Raises ``StoreAway``."""
-        with self.temporary() as copy, _answering():
+        with self.temporary() as copy:
             try:
-                self._s3.get_file(self._key(digest), str(copy))
+                self._download(digest, copy)
             except FileNotFoundError:
                 return False
             if sha256_of(copy) == digest:
                 return False
-            self._s3.cp_file(self._key(digest), f"{self._root}/damaged/{digest}")
-            self._s3.rm_file(self._key(digest))
+            with self._answering():
+                self._s3.cp_file(self._key(digest), f"{self._root}/damaged/{digest}")
+                self._s3.rm_file(self._key(digest))
         self._place(digest).unlink(missing_ok=True)
         return True
 
     def check(self) -> None:
-        """Raise OSError if files cannot be stored now."""
+        """As ``Store.check``, within ``PROBE_S`` seconds."""
         super().check()
-        with _answering():
-            self._s3.pipe_file(f"{self._root}/probe", b"heliopsf")
+        with self._answering():
+            self._s3.pipe_file(f"{self._root}/probe", b"heliopsf", timeout=PROBE_S)
 
     def keep(self, temporary: Path, digest: str | None = None) -> str:
         """Upload a complete file and keep it as a local copy; returns its SHA-256. Raises ``StoreAway``."""
         digest = digest or sha256_of(temporary)
-        with _answering():
+        with self._answering():
             self._s3.put_file(str(temporary), self._key(digest))
         self._keep_copy(temporary, self._place(digest))
         return digest
@@ -108,12 +159,12 @@ class RemoteStore(Store):
     def kept_at(self, digest: str) -> float | None:
         """The time when a file was last stored; None if it is not in the store. Raises ``StoreAway``."""
         there = self._about(digest)
-        return None if there is None else float(there["LastModified"].timestamp())
+        return None if there is None else there.kept_at
 
     def blobs(self) -> Iterator[Blob]:
         """All files of the store, in the order of the first digit of their hashes. Raises ``StoreAway``."""
         for digit in "0123456789abcdef":
-            with _answering():
+            with self._answering():
                 found = self._s3.find(f"{self._root}/blobs", prefix=digit, detail=True)
             for name, about in sorted(found.items()):
                 yield Blob(name.rsplit("/", 1)[1], int(about["size"]), about["LastModified"].timestamp())
@@ -123,50 +174,86 @@ class RemoteStore(Store):
 
         S3 cannot check and move a file in one step: a file that is stored in between is lost, but not its copy aside.
         """
-        with _answering():
-            if not self._is_old(digest, kept_before):
-                return False
-            try:
-                self._s3.cp_file(self._key(digest), self._key_aside(digest))
-            except FileNotFoundError:
-                return False
-            # Check again, because it takes long to copy a large file.
-            if not self._is_old(digest, kept_before):
-                return False
+        if not self._is_old(digest, kept_before):
+            return False
+        if not self._copy(self._key(digest), self._key_aside(digest)):
+            return False
+        # Check again, because it takes long to copy a large file.
+        if not self._is_old(digest, kept_before):
+            return False
+        with self._answering():
             self._s3.rm_file(self._key(digest))
         self._place(digest).unlink(missing_ok=True)
         return True
 
     def aside(self, before: float = math.inf) -> set[str]:
         """As ``Store.aside``. Raises ``StoreAway``."""
-        with _answering():
-            found = self._s3.find(f"{self._root}/aside", detail=True)
+        with self._answering():
+            # With a prefix, s3fs does not take the folder for an object if a file is moved there just after an empty listing.
+            found = self._s3.find(self._root, prefix="aside/", detail=True)
         moved = {name: about["LastModified"].timestamp() for name, about in found.items()}
         return {name.rsplit("/", 1)[1] for name, moved_at in moved.items() if moved_at < before}
 
     def bring_back(self, digest: str) -> bool:
         """As ``Store.bring_back``; the copy aside stays until ``delete_aside``. Raises ``StoreAway``."""
-        with _answering():
-            if self._s3.exists(self._key(digest)):
-                return False
-            try:
-                self._s3.cp_file(self._key_aside(digest), self._key(digest))
-            except FileNotFoundError:
-                return False
-        return True
+        return self._about(digest) is None and self._copy(self._key_aside(digest), self._key(digest))
 
     def delete_aside(self, digest: str) -> None:
         """As ``Store.delete_aside``. Raises ``StoreAway``."""
-        with _answering(), suppress(FileNotFoundError):
+        with self._answering():
             self._s3.rm_file(self._key_aside(digest))
 
-    def _about(self, digest: str) -> dict[str, Any] | None:
-        """The size and the time of the object; None if there is no such object."""
-        with _answering():
+    def _about(self, digest: str) -> Blob | None:
+        """Size and time of a file; None if it is absent. Raises ``StoreAway``."""
+        bucket, _, name = self._key(digest).partition("/")
+        with self._answering():
             try:
-                return dict(self._s3.info(self._key(digest), refresh=True))
+                head = self._s3.call_s3("head_object", Bucket=bucket, Key=name)
             except FileNotFoundError:
-                return None
+                head = None
+        if head is None:
+            return self._listed(self._key(digest))
+        return Blob(digest, int(head["ContentLength"]), head["LastModified"].timestamp())
+
+    def _copy(self, source: str, target: str) -> bool:
+        """Copy an object within the bucket; returns False if the source is absent."""
+        try:
+            with self._answering(source):
+                self._s3.cp_file(source, target)
+        except FileNotFoundError:
+            return False
+        return True
+
+    def _listed(self, key: str) -> Blob | None:
+        """Size and time of an object as a listing of the bucket shows them; None if it is absent. Raises ``StoreAway``."""
+        bucket, _, name = key.partition("/")
+        with self._answering():
+            listed = self._s3.call_s3("list_objects_v2", Bucket=bucket, Prefix=name, MaxKeys=1)
+        for one in listed.get("Contents", ()):
+            if one["Key"] == name:
+                return Blob(name.rsplit("/", 1)[1], int(one["Size"]), one["LastModified"].timestamp())
+        return None
+
+    @contextmanager
+    def _answering(self, key: str | None = None) -> Iterator[None]:
+        """Turn errors of S3 and of the network into ``StoreAway``.
+
+        key: the object that the block reads. FileNotFoundError leaves the block only if this object is absent.
+        """
+        if time.monotonic() < self._silent_until:
+            raise StoreAway("the object store gave no answer a moment ago: try again later")
+        try:
+            yield
+        except (BotoCoreError, ResponseParserError, aiohttp.ClientError, OSError) as error:
+            if is_disk_full(error):  # the disk of the local copies is full
+                raise
+            if key is not None and isinstance(error, FileNotFoundError) and self._listed(key) is None:
+                raise
+            if isinstance(error, SILENT):
+                self._silent_until = time.monotonic() + self._patience.pause_s
+            raise StoreAway(
+                f"the object store does not answer ({type(error).__name__}): try again later"
+            ) from error
 
     def _is_old(self, digest: str, kept_before: float) -> bool:
         """Whether the file exists and was last stored before this time."""
@@ -184,15 +271,16 @@ class RemoteStore(Store):
             try:
                 self._download(digest, partial)
             except FileNotFoundError:
-                if not self.bring_back(digest):
-                    raise
-                self._download(digest, partial)
+                self.bring_back(digest)
+                self._download(digest, partial)  # in any case, as in ``size``
+            if sha256_of(partial) != digest:
+                self._download(digest, partial)  # the answer may have been wrong, and not the object
             if sha256_of(partial) != digest:
                 raise BadFile("file-damaged", f"expected the file {digest} as it was stored; {DAMAGED}")
             self._keep_copy(partial, copy)
 
     def _download(self, digest: str, to: Path) -> None:
-        with _answering():
+        with self._answering(self._key(digest)):
             self._s3.get_file(self._key(digest), str(to))
 
     def _keep_copy(self, temporary: Path, copy: Path) -> None:
@@ -222,18 +310,3 @@ class RemoteStore(Store):
                 return
             path.unlink(missing_ok=True)
             total -= size
-
-
-@contextmanager
-def _answering() -> Iterator[None]:
-    """Turn errors of S3 and of the network into ``StoreAway``. FileNotFoundError for a missing object is not changed."""
-    try:
-        yield
-    except FileNotFoundError:
-        raise
-    except (BotoCoreError, aiohttp.ClientError, OSError) as error:
-        if is_disk_full(error):  # the disk of the local copies is full
-            raise
-        raise StoreAway(
-            f"the object store does not answer ({type(error).__name__}): try again later"
-        ) from error

@@ -42,7 +42,10 @@ _FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 
 
 class StoreAway(ConnectionError):
-    """The storage does not respond now; a later attempt may succeed."""
+    """The storage gives no answer, or a wrong one: whether it has a file cannot be found out now.
+
+    A later attempt may succeed. Nothing that cannot be undone may follow from this error.
+    """
 
 
 FileState = Literal["good", "lost", "damaged"]
@@ -295,12 +298,18 @@ class Store:
         (self._aside / digest).unlink(missing_ok=True)
 
 
-def open_store(settings: Settings) -> Store:
-    """The store that the settings name: a local folder, or S3. Raises ``MissingExtra`` if the packages for S3 are missing."""
+def open_store(settings: Settings, *, within_requests: bool = False) -> Store:
+    """The store that the settings name: a local folder, or S3. Raises ``MissingExtra`` if the packages for S3 are missing.
+
+    within_requests: whether people wait for the answers; calls of S3 then give up earlier.
+    """
     if settings.store_url is None:
         return Store(settings.data_dir)
     remote = module_of_extra("workers.files.s3_store").RemoteStore
-    store: Store = remote(settings.store_url, settings.data_dir, settings.store_cache_mib * 2**20)
+    copies_bytes = settings.store_cache_mib * 2**20
+    store: Store = remote(
+        settings.store_url, settings.data_dir, copies_bytes, within_requests=within_requests
+    )
     return store
 
 

@@ -14,11 +14,12 @@ from functools import cache
 from importlib import import_module
 from typing import Any
 
-from sqlalchemy.exc import InterfaceError, OperationalError, SQLAlchemyError
+from sqlalchemy.exc import SQLAlchemyError
 
 from psfcore.errors import DataError
 from workers import logs, traces
 from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.database import is_away
 from workers.catalogue.jobs import Lease
 from workers.catalogue.owners import NOT_KEPT
 from workers.catalogue.tables import JobRow, ProductRow, PsfRow, ReportRow
@@ -34,8 +35,12 @@ from workers.tasks.context import Context, TurnOver
 log = logging.getLogger(__name__)
 FAILED = "job %s: %s (%s)"  # log line about a failed job: its id, and the message and the code of its error
 
-TRANSIENT = (OperationalError, InterfaceError, ConnectionError, TimeoutError)
 LATE = ("psfcore.build", "psfcore.drawing.plots")  # libraries that tasks load when they need them
+
+
+def is_transient(error: BaseException) -> bool:
+    """Whether the same work may succeed later: the database, the store or the network could not be used now."""
+    return isinstance(error, ConnectionError | TimeoutError) or is_away(error)
 
 
 def load_tasks() -> None:
@@ -171,11 +176,12 @@ class Runner:
         except Cancelled:
             aborted = self._persist(lambda: self._catalogue.jobs.abort(lease))
             log.info("job %s: %s", job.id, "aborted" if aborted else "lease lost; another worker has the job")
-        except TRANSIENT as error:
-            self._retry(job, lease, error)
         except (DataError, TookTooLong) as error:
             self._fail(lease, self._error_of(job, error))
         except Exception as error:
+            if is_transient(error):
+                self._retry(job, lease, error)
+                return
             log.exception("job %s failed", job.id)
             self._fail(lease, self._error_of(job, error))
         else:
@@ -222,12 +228,12 @@ class Runner:
         attempt.started = time.monotonic()
         try:
             piece()
-        except (Cancelled, *TRANSIENT):
+        except Cancelled:
             raise
         except (DataError, TookTooLong) as error:
             return self._error_of(job, error)
         except Exception as error:
-            if is_disk_full(error):
+            if is_disk_full(error) or is_transient(error):
                 raise
             log.exception("job %s: a piece of its work failed", job.id)
             return self._error_of(job, error)
@@ -292,8 +298,8 @@ class Runner:
         while True:
             try:
                 return write()
-            except TRANSIENT as error:
-                if time.monotonic() > deadline:
+            except SQLAlchemyError as error:
+                if not is_away(error) or time.monotonic() > deadline:
                     raise
                 log.warning("could not write the outcome of a job, trying again: %s", error)
                 time.sleep(0.5)

@@ -13,6 +13,8 @@ import os
 import signal
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -52,13 +54,33 @@ def run_job(task: Task, job_id: str) -> None:
 
     The message names a job of this queue, but another job may run.
     """
-    _runner().run_next(job_id, queue_of_broker(task.request.delivery_info["routing_key"]))
+    with _waiting_for_the_database(job_id):
+        _runner().run_next(job_id, queue_of_broker(task.request.delivery_info["routing_key"]))
 
 
 @app.task(name=queue.ASSIST)
 def assist(job_id: str) -> None:
     """Share the work of a job that another worker runs."""
-    _runner().assist(job_id)
+    with _waiting_for_the_database(job_id):
+        _runner().assist(job_id)
+
+
+@contextmanager
+def _waiting_for_the_database(job_id: str) -> Iterator[None]:
+    """If the database cannot be used now, end the work with a line in the log.
+
+    The row of the job says what to do: it is submitted again, at once or when its lease has expired.
+    """
+    from sqlalchemy.exc import SQLAlchemyError
+
+    from workers.catalogue.database import is_away
+
+    try:
+        yield
+    except SQLAlchemyError as error:
+        if not is_away(error):
+            raise
+        log.warning("message of job %s: the database cannot be used: %s", job_id, str(error).split("\n")[0])
 
 
 @setup_logging.connect
@@ -94,10 +116,11 @@ def check_tables() -> None:
 
     Raises ``workers.catalogue.schema.SchemaError`` if this version of the software needs another revision.
     """
-    from sqlalchemy.exc import OperationalError
+    from sqlalchemy.exc import SQLAlchemyError
 
     from workers import checks
     from workers.catalogue.catalogue import Catalogue
+    from workers.catalogue.database import is_away
 
     catalogue = Catalogue(
         settings.catalogue_url
@@ -107,7 +130,9 @@ def check_tables() -> None:
             try:
                 catalogue.schema.check()
                 return
-            except OperationalError as error:
+            except SQLAlchemyError as error:
+                if not is_away(error):
+                    raise
                 log.warning("waiting for the database: %s", checks.database_said(error))
                 time.sleep(WAIT_S)
     finally:

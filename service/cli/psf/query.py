@@ -72,8 +72,8 @@ def list_published() -> None:
 def get_psfs(names: tuple[str, ...], source: Path | None) -> None:
     """Bring published PSFs, whose names then stand for them: `heliopsf deconvolve --psf NAME`.
 
-    A broken download is tried again. The SHA-256 of the file is recorded at the first time and compared afterwards.
-    HELIOPSF_CACHE_DIR names the folder that keeps them; several machines may share it.
+    A broken download is tried again; it is kept only if it has the published checksum. HELIOPSF_CACHE_DIR names the folder that
+    keeps them; several machines may share it.
     """
     for name in names:
         brought(name, source)
@@ -86,6 +86,8 @@ def brought(name: str, source: Path | None) -> Path:
         file = get(published_folder(), name, source=source, progress=report)
     one = published(name)
     echo(f"{file}: PSF {one.name}, {one.telescope} {one.channel}")
+    if source is not None and one.sha256 is None:
+        echo(f"  not compared with a checksum, because none of {one.file} is known here")
     echo(f"  cite {one.citation}" + ("" if one.doi is None else f"; doi:{one.doi}"))
     return file
 

@@ -85,6 +85,8 @@ def test_an_idle_stream_sends_comments_and_a_closed_connection_frees_its_stream(
     live.catalogue.jobs.complete(lease, "r" * 64)
     following.join(10)
     assert following.said("event:") == ["progress", "end"]
+    lookouts = live.app.state.heliopsf.lookouts
+    wait_for(lambda: not lookouts, "nobody looks for an owner without streams", timeout_s=10)
 
 
 def test_a_job_that_is_destroyed_and_a_server_that_stops_end_their_streams(live: Live) -> None:

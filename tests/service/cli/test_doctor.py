@@ -74,22 +74,34 @@ def test_with_nothing_there_it_says_so_and_makes_nothing(tmp_path: Path) -> None
 def test_all_is_well_where_a_worker_is_there(catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
     catalogue.census.announce("host:1", time.time(), software_version())
     assert set(states()) == {
-        "versions", "threads", "kernels", "wall", "storage", "broker", "database", "schema", "clock", "workers", "stuck jobs",
+        "versions", "python", "threads", "kernels", "wall", "storage", "broker", "database", "schema", "changes", "clock",
+        "workers", "stuck jobs",
     }  # fmt: skip
     found = findings()
-    for what in ("kernels", "storage", "broker", "database", "schema", "clock", "workers", "stuck jobs"):
+    for what in found.keys() - {"versions", "python", "threads", "wall"}:
         assert found[what]["state"] == "ok", found[what]
     assert "host:1" in found["workers"]["found"]
     for acting, state, word in (
-        ({"files": True, "calls": True}, "ok", "its file alone"),
-        ({"files": False, "calls": True}, "warning", "no socket"),
-        ({"files": False, "calls": False}, "warning", "no wall"),
+        ({"files": True, "calls": True, "user": True}, "ok", "its file alone"),
+        ({"files": False, "calls": True, "user": True}, "warning", "no socket"),
+        ({"files": False, "calls": False, "user": True}, "warning", "no wall"),
+        ({"files": True, "calls": True, "user": False}, "warning", "it is root"),
     ):
         monkeypatch.setattr(cli_doctor.limited, "acting", lambda path, acting=acting: acting)
         assert findings()["wall"]["state"] == state and word in findings()["wall"]["found"]
     monkeypatch.setattr(cli_doctor, "folder_of_kernels", lambda: (Path("/nowhere"), False))
     told = findings()["kernels"]
     assert told["state"] == "warning" and "/nowhere" in told["found"] and "NUMBA_CACHE_DIR" in told["advice"]
+
+
+@pytest.mark.parametrize(
+    ("release", "advice"),
+    [((3, 11, 9), "3.11.10"), ((3, 11, 10), ""), ((3, 12, 5), "3.12.6"), ((3, 12, 6), ""), ((3, 13, 0), "")],
+)
+def test_an_old_python_is_named(release: tuple[int, int, int], advice: str) -> None:
+    told = cli_doctor.python(release)
+    assert told.state == ("warning" if advice else "ok") and advice in told.advice
+    assert ".".join(map(str, release)) in told.found
 
 
 def test_a_broken_url_is_a_plain_sentence_without_its_password(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -82,7 +82,7 @@ def long_header(mib: int) -> bytes:
 
 FILES = [
     image("100 MB of cards in gzip", 422, "header-too-long", lambda: gzip.compress(long_header(100), 1)),
-    image("gzip that declares 300 GB", 422, "too-many-bytes", lambda: gzip.compress(primary(8, 10**5, 10**5, 30) + bytes(10**6))),
+    image("gzip that declares 300 GB", 422, "three-axes", lambda: gzip.compress(primary(8, 10**5, 10**5, 30) + bytes(10**6))),
     image("a script", 415, "not-fits", lambda: b"#!/bin/sh\nrm -rf /\n" * 500),
     image("more than may be sent", 413, "too-large", lambda: b"SIMPLE  =" + bytes(9 * MIB)),
     image("nothing", 400, "empty-upload", lambda: b""),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import shutil
 import subprocess
@@ -101,11 +102,38 @@ def test_an_older_database_is_upgraded_with_its_data(
         later.check()
     caplog.set_level(logging.INFO, "workers.catalogue.schema")
     caplog.clear()
-    later.upgrade()
-    later.upgrade()
+    copy = later.upgrade()
+    assert later.upgrade() is None
     assert later.status().state == "current" and catalogue.schema.status().state == "newer"
-    assert said(caplog) == ["database: upgraded from 0020 to 0021"]
+    [line] = said(caplog)
+    assert line.startswith("database: upgraded from 0020 to 0021")
+    if database(catalogue).sqlite:
+        assert copy is not None and line.endswith(str(copy)) and copy.stat().st_mode & 0o777 == 0o600
+        old = Catalogue(f"sqlite:///{copy}")
+        assert old.schema.status().state == "current", "this version, which is the older one, reads it"
+        assert rows(old, text("SELECT name FROM workers")) == ["w"]
+        old.close()
+    else:
+        assert copy is None
     assert rows(catalogue, text("SELECT name || host FROM workers")) == ["w-here"]
+
+
+@sqlite_alone
+def test_a_database_that_cannot_be_copied_is_not_upgraded(catalogue: Catalogue, tmp_path: Path) -> None:
+    catalogue.upgrade()
+    shutil.copytree(REVISIONS, tmp_path / "later")
+    (tmp_path / "later" / "versions" / "r0021_later.py").write_text(LATER)
+    later = Schema(database(catalogue), tmp_path / "later")
+    before = {file.name for file in tmp_path.iterdir()}
+
+    def no_room(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.MonkeyPatch.context() as full:
+        full.setattr("workers.catalogue.schema.os.fsync", no_room)
+        with pytest.raises(SchemaError, match=r"to copy the database to .*No space left.*make room there"):
+            later.upgrade()
+    assert later.status().state == "older" and {file.name for file in tmp_path.iterdir()} == before
 
 
 @sqlite_alone

@@ -20,8 +20,8 @@ def store(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.Mo
 
 @pytest.fixture
 def remote(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Store]:
-    """In S3; its copies here are measured at once, may be removed at once, and requests are repeated once."""
-    for name, value in (("LOOK_AFTER_S", -1.0), ("IN_USE_S", 0.0), ("RETRIES", 1)):
+    """In S3; its copies here are measured at once, and may be removed at once."""
+    for name, value in (("LOOK_AFTER_S", -1.0), ("IN_USE_S", 0.0)):
         monkeypatch.setattr(s3_store, name, value)
     with opened_store("s3", tmp_path, monkeypatch, store_cache_mib=1) as opened:
         yield opened

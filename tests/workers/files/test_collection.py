@@ -294,28 +294,6 @@ def test_a_collection_killed_anywhere_loses_nothing(
     assert steps == 8, "two were put aside and deleted, one came back, both copies went"
 
 
-def test_a_store_that_finds_nothing_for_a_moment_loses_no_file(
-    remote: Store, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A failover answers that there is no such bucket. The copy aside is the only one, and a row refers to it."""
-    digest = kept(remote, b"accepted")
-    assert remote.remove(digest, time.time() + 60.0)
-    catalogue.add(image(digest))
-
-    def absent(*_keys: str, **_options: object) -> None:
-        raise FileNotFoundError("The specified bucket does not exist")
-
-    with monkeypatch.context() as failing:
-        for name in ("exists", "cp_file", "info"):
-            failing.setattr(client_of(remote), name, absent if name != "exists" else lambda key: False)
-        assert collection.settle(catalogue, remote, {digest}) == set()
-    assert names(remote, "aside") == {digest}
-    assert collection.settle(catalogue, remote, {digest}) == {digest}
-    assert (
-        client_of(remote).cat_file(key_of(remote, digest)) == b"accepted" and names(remote, "aside") == set()
-    )
-
-
 def test_files_aside_stay_if_the_database_seems_wrong(remote: Store, catalogue: Catalogue) -> None:
     orphan, _ = kept(remote, b"orphan"), kept(remote, b"a")
     assert remote.remove(orphan, time.time() + 60.0)

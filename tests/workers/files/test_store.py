@@ -237,18 +237,18 @@ def test_a_file_kept_again_is_sent_again(remote: Store, monkeypatch: pytest.Monk
 def test_a_file_kept_while_it_is_put_aside_stays(remote: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     client, again = client_of(remote), []
     kept(remote, CONTENT)
-    copied, looked_at = client.cp_file, client.info
+    copied, asked = client.cp_file, client.call_s3
 
     def kept_meanwhile(source: str, target: str) -> None:
         copied(source, target)
         again.append(kept(remote, CONTENT))
 
-    def as_old(key: str, **how: object) -> dict[str, object]:
-        about = looked_at(key, **how)
+    def as_old(method: str, **how: object) -> dict[str, object]:
+        about = asked(method, **how)
         return about if again else about | {"LastModified": about["LastModified"] - timedelta(days=9)}
 
     monkeypatch.setattr(client, "cp_file", kept_meanwhile)
-    monkeypatch.setattr(client, "info", as_old)
+    monkeypatch.setattr(client, "call_s3", as_old)
     assert not remote.remove(DIGEST, kept_before=time.time() - HOUR_S)
     assert again == [DIGEST] and digests(remote) == {DIGEST}
     assert remote.aside() == {DIGEST} and not remote.bring_back(DIGEST)
@@ -291,7 +291,6 @@ def test_a_full_disk_of_the_copies_is_not_an_object_store_that_is_away(
 
 
 def test_a_server_that_is_away(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(remote_store, "RETRIES", 1)
     with s3_bucket(monkeypatch) as (url, server):
         store = open_store(Settings(data_dir=tmp_path / "data", store_url=url))
         kept(store, CONTENT)

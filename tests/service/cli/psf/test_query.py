@@ -81,6 +81,7 @@ def test_an_operator_adds_a_psf_for_all_and_its_citation_is_in_the_lineage(
     api.app.state.heliopsf.catalogue.keys.make("ann", {"read"})
     get = ("store", "psf", "get", NAME, "--from", tmp_path / "usb", "--data", settings.data_dir)
     told = command(*get)
+    assert "not compared with a checksum" in told
     assert "ann: added" in told and "local: added" in told and "local: was there" in command(*get)
     (row,) = client.psfs(name=NAME)
     assert [row[key] for key in ("instrument", "channel", "kind", "status")] == [
