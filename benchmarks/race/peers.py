@@ -69,13 +69,14 @@ def heliopsf(image: np.ndarray, psf: np.ndarray, steps: int) -> np.ndarray:
     from astropy.io.fits import Header
 
     from psfcore.deconvolve.conditions import Conditions
-    from psfcore.deconvolve.methods.richardson_lucy import deconvolve
+    from psfcore.deconvolve.methods.registry import method_named
     from psfcore.image import Image
     from psfcore.psf import Psf
 
     observed = Image(image.astype(float), np.zeros(image.shape, np.uint8), Header(), "DN/s", 1.0)
     kernel = Psf(psf.astype(float), "bench", "1", None, "draft", None, None)
-    return deconvolve(observed, kernel, Conditions(edges="zero", threads=THREADS), steps=steps).pixels
+    conditions = Conditions(edges="zero", threads=THREADS)
+    return method_named("richardson-lucy")(observed, kernel, conditions, steps=steps).pixels
 
 
 def plain_steps(

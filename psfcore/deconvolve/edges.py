@@ -24,18 +24,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.convolution.engine import BLOCK_ROWS
+from psfcore.deconvolve.declaration import Edges
 from psfcore.errors import DataError
 from psfcore.image import Image
 from psfcore.psf import Psf
 
-Edges = Literal["zero", "symmetric", "extended"]
-EDGES: tuple[Edges, ...] = ("zero", "symmetric", "extended")
+EDGES: tuple[Edges, ...] = get_args(Edges)
 
 # If more than this share of a pixel's light may come from beyond the field, the pixel is flagged and left out of chi2.
 FLAGGED_SHARE = 0.05

@@ -5,7 +5,7 @@ The memory follows from the sizes of image and PSF:
     bytes = plane_bytes P + transform_bytes L + image_bytes I + psf_bytes K        Eq. (1)
 
 `python -m benchmarks.growth memory` measures both sides of Eq. (1). The size of the margin follows from the PSF, which may not
-exist yet; the shares of MARGIN_SHARE were measured with the PSF of HRI_EUV, which scatters much light. This module
+exist yet; the figure margin_of_psf of each method was measured with the PSF of HRI_EUV, which scatters much light. This module
 imports no numerical libraries, because the web process uses it too.
 
 | symbol | name | unit |
@@ -20,11 +20,10 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TypeVar
 
 from psfcore.convolution.lengths import LARGEST_LENGTH, good_length
+from psfcore.deconvolve.methods.registry import method_names, properties_of
 from psfcore.errors import DataError
 
 BOX = r"^\d{1,6}:\d{1,6},\d{1,6}:\d{1,6}$"
@@ -33,25 +32,6 @@ LARGEST_ERROR = 0.05  # default of the largest bound of the error, as a share of
 EXPECTED_RIM_PX = 384  # for estimates; the width of the rim follows from the pixels
 
 Shape = tuple[int, int]
-# Default margin divided by half the width of the PSF. It is at most half the width of the image.
-MARGIN_SHARE = {
-    "richardson-lucy": 0.08,
-    "richardson-lucy-accelerated": 0.08,
-    "richardson-lucy-extended": 0.56,
-    "richardson-lucy-total-variation": 0.08,
-    "basic-iterative": 0.28,
-    "linear": 0.28,
-}
-# plane_bytes and transform_bytes of each method. At its end, a linear method also computes its noise amplification from the
-# transfer function.
-WORKING_BYTES = {
-    "richardson-lucy": (8.0, 8.0),
-    "richardson-lucy-accelerated": (24.0, 8.0),
-    "richardson-lucy-extended": (26.0, 8.0),
-    "richardson-lucy-total-variation": (20.0, 8.0),
-    "basic-iterative": (12.0, 18.0),
-    "linear": (12.0, 19.0),
-}
 IMAGE_BYTES = 20.0  # the image and the result in float64, the mask, and a comparison of both
 ERRORS_BYTES = 240.0  # further bytes for each pixel of the image, if errors are estimated
 PSF_BYTES = 8.0
@@ -60,7 +40,6 @@ ASSESSED_BYTES = (
 )
 READ_BYTES = 25.0  # for each pixel of the image beyond the region that is deconvolved
 MIB = 2**20
-Figure = TypeVar("Figure", float, tuple[float, float])
 
 
 @dataclass(frozen=True)
@@ -166,7 +145,7 @@ class Demand:
             return 0
         if self.margin_px is not None:
             return self.margin_px
-        share = of_method(MARGIN_SHARE, self.method)
+        share = _figure(self.method, "margin_of_psf")
         return int(min(share * max(self.psf) / 2, min(self.image) / 2))
 
     @property
@@ -178,7 +157,7 @@ class Demand:
     @property
     def transform(self) -> Shape:
         """Lengths of the transforms: the plane, and the light that crosses its edge must not wrap into the image."""
-        extended = self.edges == "extended" or (self.edges is None and self.method.endswith("-extended"))
+        extended = (self.edges or properties_of(self.method).edges) == "extended"
         sought = self.margin if extended else 0
         ny, nx = (
             max(side, size + sought + min(psf // 2, size + sought - 1))
@@ -190,7 +169,7 @@ class Demand:
 def deconvolution_bytes(demand: Demand) -> float:
     """Eq. (1): the memory of a deconvolution, with its image, its PSF and its result, in bytes."""
     image_bytes = IMAGE_BYTES + (ERRORS_BYTES if demand.draws else 0.0)
-    plane_bytes, transform_bytes = of_method(WORKING_BYTES, demand.method)
+    plane_bytes, transform_bytes = (_figure(demand.method, one) for one in ("plane_bytes", "transform_bytes"))
     return (
         plane_bytes * math.prod(demand.plane)
         + transform_bytes * math.prod(demand.transform)
@@ -222,9 +201,10 @@ def check_memory(image: Shape, needed_bytes: float, free_bytes: int) -> None:
     )
 
 
-def of_method(figures: Mapping[str, Figure], method: str) -> Figure:
-    """The figure of a method; the largest figure of all methods if this method has not been measured yet."""
-    return figures.get(method, max(figures.values()))
+def _figure(method: str, name: str) -> float:
+    """A measured figure of a method; the largest one of all methods if it was not measured for this one."""
+    figures = {one: getattr(properties_of(one), name) for one in method_names()}
+    return float(figures[method] or max(filter(None, figures.values())))
 
 
 def _length(at_least: int) -> int:

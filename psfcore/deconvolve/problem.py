@@ -19,17 +19,17 @@ of the light may come from beyond the field, which the model does not contain.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.convolution.engine import Engine
 from psfcore.deconvolve.conditions import Conditions, Deconvolved, fluxes
+from psfcore.deconvolve.declaration import Method, Stop
 from psfcore.deconvolve.edges import (
     FLAGGED_SHARE,
     Domain,
-    Edges,
     band_px,
     lay_out,
     margin_for,
@@ -41,28 +41,9 @@ from psfcore.image import Image
 from psfcore.psf import Psf
 from psfcore.psf_sampling import check_compatible
 
-Stop = Literal["fixed", "discrepancy"]
-MOST_STEPS = 10_000
 # The first value of a missing pixel is computed from trusted neighbours if the PSF's weights on them sum to more than
 # this.
 _ENOUGH_NEIGHBOURS = 1e-4
-
-
-@dataclass(frozen=True)
-class Method:
-    """A method of deconvolution, except its iteration.
-
-    edges: the default assumption about the scene beyond the edges. margin_share: largest share of its light that a pixel at
-    the edge may get from beyond the margin; `margin_for` computes the default width of the margin from it. may_be_negative:
-    whether results can be negative. keeps_flux: whether the steps conserve the flux of the plane, and so compensate for light
-    that leaves it (`psfcore.deconvolve.work`).
-    """
-
-    name: str
-    edges: Edges
-    margin_share: float
-    may_be_negative: bool = False
-    keeps_flux: bool = False
 
 
 class Iteration:
@@ -138,7 +119,7 @@ class Problem:
     judgement: Judgement
     edge_band_px: int
     steps: int
-    stop: Stop
+    stop: str
 
     def solve(self, iteration: Iteration) -> Deconvolved:
         """Run a method's iteration until it stops, and turn its estimate into the result for the image.
@@ -191,16 +172,12 @@ class Problem:
         return steps, f"all {steps} steps asked for were done", chi2
 
 
-def pose(
-    method: Method, image: Image, psf: Psf, conditions: Conditions, *, steps: int, stop: Stop
-) -> Problem:
+def pose(method: Method, image: Image, psf: Psf, conditions: Conditions, *, steps: int, stop: str) -> Problem:
     """Check the input and prepare a problem.
 
-    Raises DataError: "bad-steps", "bad-stop", "bad-edges", "all-masked", "no-signal", "plate-scale-mismatch", "no-exposure".
+    Raises DataError: "bad-stop", "bad-edges", "all-masked", "no-signal", "plate-scale-mismatch", "no-exposure".
     """
-    if not 1 <= steps <= MOST_STEPS:
-        raise DataError("bad-steps", f"expected 1 to {MOST_STEPS} steps; got {steps}")
-    if stop not in ("fixed", "discrepancy"):
+    if stop not in get_args(Stop):
         raise DataError("bad-stop", f"expected stop to be fixed or discrepancy; got {stop}")
     check_compatible(image, psf)
     shares = share_from_beyond(psf)

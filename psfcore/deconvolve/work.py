@@ -41,7 +41,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from inspect import signature
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -83,7 +82,7 @@ class Options(Conditions):
     method: name of the method; parameters: its own parameters, such as steps and stop. error_draws: number of noise
     realisations (2 to 64) for the planes of errors; 0: no such planes. region: deconvolve only this box of the image, with a
     rim that is so wide that the bound of its error is at most `region_error`, a share of the mean light of the box.
-    Raises DataError "bad-draws", "bad-margin", "region-errors", "unknown-method" and "unknown-parameter".
+    Raises DataError "bad-draws", "bad-margin", "region-errors", "unknown-method", and the errors of `Method.complete`.
     """
 
     method: str = "richardson-lucy"
@@ -100,14 +99,8 @@ class Options(Conditions):
             raise DataError(
                 "bad-draws", f"error_draws: expected 0, or 2 to {MOST_DRAWS}; got {self.error_draws}"
             )
-        of_method = signature(method_named(self.method)).parameters.values()
-        names = [one.name for one in of_method if one.kind is one.KEYWORD_ONLY]
-        for name in self.parameters:
-            if name not in names:
-                raise DataError(
-                    "unknown-parameter",
-                    f"expected parameters of {self.method}, {', '.join(names)}; got {name!r}",
-                )
+        of_method = {name: value for name, value in self.parameters.items() if name != "stop"}
+        properties_of(self.method).complete(of_method)
 
 
 @dataclass(frozen=True)

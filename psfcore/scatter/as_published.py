@@ -40,7 +40,7 @@ from threadpoolctl import threadpool_limits
 from psfcore.convolution.convolver import Convolver
 from psfcore.convolution.engine import Engine
 from psfcore.deconvolve.conditions import Conditions, PreparedPsfs
-from psfcore.deconvolve.methods.richardson_lucy import deconvolve
+from psfcore.deconvolve.methods.registry import method_named
 from psfcore.errors import DataError
 from psfcore.image import Image
 from psfcore.psf import (
@@ -432,7 +432,8 @@ class _Recipe:
                 unit="DN/s",
                 exposure_s=frame.exposure_s,
             )
-            scenes.append(deconvolve(image, psf, conditions, steps=LUCY_STEPS).pixels.astype(np.float32))
+            scene = method_named("richardson-lucy")(image, psf, conditions, steps=LUCY_STEPS).pixels
+            scenes.append(scene.astype(np.float32))
         return scenes
 
     def _equations_of_frame(

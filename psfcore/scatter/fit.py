@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from psfcore.arrays import json_attributes
 from psfcore.convolution.convolver import Convolver
-from psfcore.deconvolve.methods.linear import LEAST_TRANSFER
+from psfcore.deconvolve.iterations.linear import LEAST_TRANSFER
 from psfcore.psf import (
     CURVE_RADII_PX,
     REACH_GRID_PX,

@@ -52,7 +52,7 @@ from psfcore.convolution.convolver import Convolver
 from psfcore.convolution.engine import BLOCK_ROWS, Engine
 from psfcore.convolution.fft_kernels import LANES
 from psfcore.deconvolve.assess.error_planes import sigma_points
-from psfcore.deconvolve.methods.linear import inverse_filter, solve_linear, transfer_sample
+from psfcore.deconvolve.iterations.linear import inverse_filter, solve_linear, transfer_sample
 from psfcore.errors import DataError
 from psfcore.noise import Noise
 from psfcore.psf import CURVE_RADII_PX, REACH_GRID_PX, FittedShape, Psf, encircled_energy
@@ -210,7 +210,7 @@ class Optics(Blur):
     """Convolution with a PSF, and its approximate inverse.
 
     least_transfer: the smallest absolute value of the PSF's Fourier transform. Eq. (1) converges at once where it is at least
-    LEAST_TRANSFER of `psfcore.deconvolve.methods.linear`, and slowly where it is smaller.
+    LEAST_TRANSFER of `psfcore.deconvolve.iterations.linear`, and slowly where it is smaller.
     """
 
     def __init__(

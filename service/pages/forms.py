@@ -20,7 +20,7 @@ from service.http.guard import check_text
 from service.http.problems import Problem
 from service.http.state import State
 from workers.contract.kinds import KINDS, JobRequest
-from workers.contract.requests import METHOD_MODELS, METHODS, RichardsonLucy
+from workers.contract.requests import METHOD_MODELS, METHODS
 from workers.contract.suggestions import explained
 
 Sent = Mapping[str, str | UploadFile]
@@ -82,7 +82,7 @@ def number_field(kind: str, name: str) -> Markup:
     """The attributes of an input for a number of a request: its type, name and limits."""
     model = KINDS[kind].parameters
     assert model is not None
-    field = model.model_fields.get(name) or RichardsonLucy.model_fields[name]
+    field = model.model_fields.get(name) or METHOD_MODELS[METHODS[0]].model_fields[name]
     limits = {_ATTRIBUTES[type(one)]: one for one in field.metadata if type(one) in _ATTRIBUTES}
     attributes = {attribute: getattr(one, limit) for (attribute, limit), one in limits.items()}
     return Markup(" ").join(
@@ -130,14 +130,12 @@ def wrong_fields(error: ValidationError, model: Any, *, above: int = 0) -> Probl
 
 def usual_steps() -> dict[str, int]:
     """The default number of steps of each method; the default method first."""
-    return {
-        name: model.model_fields["steps"].default for name, model in zip(METHODS, METHOD_MODELS, strict=True)
-    }
+    return {name: model.model_fields["steps"].default for name, model in METHOD_MODELS.items()}
 
 
 def chosen_method(form: Sent) -> dict[str, str]:
     """The parameter ``method`` of a request. If the form gives no number of steps, the method's default applies."""
-    return {"name": text(form, "method") or RichardsonLucy().name, **filled(form, "steps")}
+    return {"name": text(form, "method") or METHODS[0], **filled(form, "steps")}
 
 
 def deconvolution(image_id: str, form: Sent) -> JobRequest:

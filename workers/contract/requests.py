@@ -1,18 +1,20 @@
 """Parameters of every job kind: as a client sends them, and (``Resolved...``) as the worker gets them.
 
 The web process and the workers both import this module, so it must not load numerical libraries.
-``workers.contract.kinds`` makes the requests from these models. To add a method of deconvolution, write a class here, a
-file in ``psfcore/deconvolve/methods`` and a test.
+``workers.contract.kinds`` makes the requests from these models. The parameters of a method of deconvolution are those that its
+file in ``psfcore/deconvolve/methods`` declares.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Union
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model, model_validator
 
+from psfcore.deconvolve import declaration
+from psfcore.deconvolve.declaration import Edges, Stop
 from psfcore.deconvolve.extent import (
     BOX,
     LARGEST_ERROR,
@@ -20,6 +22,7 @@ from psfcore.deconvolve.extent import (
     region_without_discrepancy,
     region_without_errors,
 )
+from psfcore.deconvolve.methods.registry import DEFAULT, method_names, properties_of
 from psfcore.errors import DataError
 from psfcore.instruments.model import MOST_BYTES
 from psfcore.noise import NoiseFigures
@@ -91,13 +94,16 @@ class Parameters(BaseModel):
 
 
 class _Method(Parameters):
-    """Parameters that every method of deconvolution has. Each method adds its own."""
+    """Parameters that every method of deconvolution has. Each method adds its own, and its name."""
 
-    stop: Literal["fixed", "discrepancy"] = Field(
+    if TYPE_CHECKING:
+        name: str
+        steps: int
+    stop: Stop = Field(
         "fixed",
         description="`fixed`: do all `steps`; `discrepancy`: stop once the residual is like the noise",
     )
-    edges: Annotated[Literal["zero", "symmetric", "extended"] | None, Option(metavar="SCENE")] = Field(
+    edges: Annotated[Edges | None, Option(metavar="SCENE")] = Field(
         None, description="scene beyond the field: zero, symmetric or extended; null: depends on the method"
     )
     margin_px: int | None = Field(
@@ -108,69 +114,32 @@ class _Method(Parameters):
     )
 
 
-class RichardsonLucy(_Method):
-    """For most images. The paper recommends 20 steps and edges `zero`."""
-
-    algorithm_version: ClassVar[int] = 2
-    name: Literal["richardson-lucy"] = "richardson-lucy"
-    steps: int = Field(20, ge=1, le=200, description="iterations; the paper uses 20")
-
-
-class RichardsonLucyAccelerated(_Method):
-    """For many images: the same result in half the steps. The extrapolation is that of Biggs and Andrews."""
-
-    algorithm_version: ClassVar[int] = 1
-    name: Literal["richardson-lucy-accelerated"]
-    steps: int = Field(10, ge=1, le=200)
-    order: Literal[1, 2] = Field(1, description="order of the extrapolation")
-
-
-class RichardsonLucyExtended(_Method):
-    """For cut-outs with bright light beyond their edges. Bertero and Boccacci describe it."""
-
-    algorithm_version: ClassVar[int] = 1
-    name: Literal["richardson-lucy-extended"]
-    steps: int = Field(20, ge=1, le=200)
-
-
-class RichardsonLucyTotalVariation(_Method):
-    """For pictures of noisy images, not for photometry. The total variation is regularised."""
-
-    algorithm_version: ClassVar[int] = 1
-    name: Literal["richardson-lucy-total-variation"]
-    steps: int = Field(20, ge=1, le=200)
-    smoothing: float = Field(
-        0.01, ge=0, le=0.02, description="weight of the regularisation, in counts; 0 gives Richardson-Lucy"
+def _request_of(method: declaration.Method) -> type[_Method]:
+    """The model of a method's parameters, as the method declares them."""
+    fields: dict[str, Any] = {}
+    for one in method.parameters:
+        least, most = (None, None) if one.values else (one.least, one.most)
+        of_type: Any = Literal[one.values] if one.values else one.type
+        fields[one.name] = (of_type, Field(one.default, ge=least, le=most, description=one.about))
+    name: Any = Literal[method.name]
+    model = create_model(
+        "".join(map(str.title, method.name.split("-"))),
+        __base__=_Method,
+        __module__=__name__,
+        __doc__=method.use,
+        name=(name, method.name if method.name == DEFAULT else ...),
+        **fields,
     )
+    model.algorithm_version = method.algorithm_version
+    return model
 
 
-class BasicIterative(_Method):
-    """For a bright source near an edge, as the paper recommends. Results may be negative."""
-
-    algorithm_version: ClassVar[int] = 1
-    name: Literal["basic-iterative"]
-    steps: int = Field(20, ge=1, le=200)
-
-
-class Linear(_Method):
-    """For photometry of faint pixels: no bias, results may be negative. It has converged after about five steps."""
-
-    algorithm_version: ClassVar[int] = 1
-    name: Literal["linear"]
-    steps: int = Field(5, ge=1, le=200)
-
-
-Method = Annotated[
-    RichardsonLucy
-    | RichardsonLucyAccelerated
-    | RichardsonLucyExtended
-    | RichardsonLucyTotalVariation
-    | BasicIterative
-    | Linear,
-    Field(discriminator="name"),
-]
-METHOD_MODELS: tuple[type[_Method], ...] = get_args(get_args(Method)[0])
-METHODS: list[str] = [get_args(one.model_fields["name"].annotation)[0] for one in METHOD_MODELS]
+METHODS: list[str] = method_names()
+METHOD_MODELS: dict[str, type[_Method]] = {name: _request_of(properties_of(name)) for name in METHODS}
+if TYPE_CHECKING:
+    Method = _Method
+else:
+    Method = Annotated[Union[tuple(METHOD_MODELS.values())], Field(discriminator="name")]  # noqa: UP007
 
 
 class PsfBuild(Parameters):
@@ -204,7 +173,7 @@ class PsfBuild(Parameters):
 class Treatment(Parameters):
     """How an image is deconvolved: the same for one image and for each image of a bulk run."""
 
-    method: Method = Field(default_factory=lambda: RichardsonLucy())
+    method: Method = Field(default_factory=lambda: METHOD_MODELS[DEFAULT].model_validate({}))
     noise: NoiseFigures | None = Field(
         None,
         description="photon gain (DN per photon), read noise (DN rms); null: published, else measured in the image",

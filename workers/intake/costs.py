@@ -43,6 +43,10 @@ class Deconvolution(_Frozen):
     step_ns: dict[str, float]
     psf_draws: int  # deconvolutions with other PSFs, for the errors of a fitted PSF: two per parameter
 
+    def of_method(self, name: str) -> float:
+        """The time of a method in ``step_ns``; that of the slowest one if it was not measured yet."""
+        return self.step_ns.get(name, max(self.step_ns.values()))
+
 
 class Build(_Frozen):
     """The time that a PSF build takes for each spectral line of the bandpass, and the memory that it needs.

@@ -20,7 +20,7 @@ from statistics import median_low
 from typing import Any
 from weakref import WeakKeyDictionary
 
-from psfcore.deconvolve.extent import EXPECTED_RIM_PX, MIB, Box, Demand, of_method, product_bytes
+from psfcore.deconvolve.extent import EXPECTED_RIM_PX, MIB, Box, Demand, product_bytes
 from psfcore.errors import DataError
 from psfcore.instruments.model import parse_instrument
 from psfcore.instruments.workload import workload
@@ -154,7 +154,7 @@ def _deconvolution(parameters: Mapping[str, Any], catalogue: Catalogue, owner: s
     fitted = interpolated or (psf is not None and "fit" in psf.details)
     runs = 1 + draws + (cost.psf_draws if draws and fitted else 0)
     cpu_s = built_s + cost.base_s + cost.image_ns * 1e-9 * ny * nx
-    cpu_s += runs * method["steps"] * of_method(cost.step_ns, method["name"]) * 1e-9 * plane
+    cpu_s += runs * method["steps"] * cost.of_method(method["name"]) * 1e-9 * plane
     return cpu_s, max(built_mib, product_bytes(asked, whole_px) / MIB)
 
 

@@ -1,250 +1,34 @@
-"""Linear deconvolution by an approximate inverse of the PSF.
-
-    x <- x + G w (y - H x),   x_0 = y,   G = T* / max(abs(T)^2, t^2)      Eq. (1)
-
-H is the convolution with the PSF, cut to the field. T is the PSF's Fourier transform on the padded, periodic plane.
-Where abs(T) is at least t (LEAST_TRANSFER), G = 1 / T, which inverts H except for light that crosses the edge of the
-field; a few steps correct for this light. Where abs(T) is below t, Eq. (1) is a Landweber step: frequencies at which
-the PSF has little power are restored slowly, and the noise at these frequencies is amplified slowly.
-
-The method does not force the scene to be positive, so faint pixels have no bias. For one PSF, the method amplifies the
-noise of every image by the same factor, `noise_amplification` (2 to 2.4 for HRI_EUV). Negative pixels are used
-unchanged, and the result may be negative. A masked pixel (w = 0) does not influence the fit; its estimate follows from
-its neighbours.
-
-Another filter G in Eq. (1) makes another linear method; `Additive` is the iteration for any G.
-
-The noise amplification is computed frequency by frequency. T is the PSF's Fourier transform at one frequency.
-After n steps, the method has multiplied the amplitude of the image at this frequency by
-
-    A_n = A_(n-1) + G (1 - T A_(n-1)),   A_0 = 1        Eq. (2)
-
-The method multiplies the rms of uncorrelated noise by the root of the mean of abs(A)^2 over all frequencies. This
-factor holds away from edges and masked pixels. T varies smoothly from frequency to frequency. Therefore only every k-th
-frequency along y is used; k is 2, 3, 4 or 8, depending on the length of the transform.
-
-| symbol | name | unit |
-|---|---|---|
-| y | observed | image unit |
-| x | estimate | image unit |
-| w | trusted, 1 or 0 | - |
-| G | inverse_filter, step_filter; step of Eq. (2): 1, or an inverse of T | - |
-| T | values of TransferSample | - |
-| A | gain | - |
-"""
+"""Linear deconvolution; `psfcore.deconvolve.iterations.linear` has the equations."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
+from psfcore.deconvolve.declaration import Method, steps
 
-from psfcore.compiled import compiled
-from psfcore.convolution.engine import (
-    BLOCK_ROWS,
-    Engine,
-    Single,
-    buffer_from_spectrum,
-    spectrum_from_buffer,
+if TYPE_CHECKING:
+    from psfcore.deconvolve.conditions import Deconvolved
+    from psfcore.deconvolve.problem import Problem
+
+METHOD = Method(
+    "linear",
+    "For photometry of faint pixels: no bias, results may be negative. It has converged after about five steps.",
+    edges="symmetric",
+    margin_share=0.015,
+    parameters=(steps(5),),
+    may_be_negative=True,
+    margin_of_psf=0.28,
+    plane_bytes=12.0,
+    # At the end, the noise amplification is computed from the transfer function.
+    transform_bytes=19.0,
 )
-from psfcore.convolution.fft_kernels import LANES, forward, inverse
-from psfcore.deconvolve.conditions import Conditions, Deconvolved
-from psfcore.deconvolve.problem import (
-    Iteration,
-    Method,
-    Problem,
-    Stop,
-    first_estimate,
-    pose,
-    relative_change,
-)
-from psfcore.image import Image
-from psfcore.psf import Psf
-
-METHOD = Method("linear", edges="symmetric", margin_share=0.015, may_be_negative=True)
-LEAST_TRANSFER = 0.1
 
 
-def deconvolve(
-    image: Image, psf: Psf, conditions: Conditions, *, steps: int = 5, stop: Stop = "fixed"
-) -> Deconvolved:
-    """Estimate the scene from `image` [y, x], which was observed with `psf`. The first estimate is the observation.
+def deconvolve(problem: Problem) -> Deconvolved:
+    """Estimate the scene. The first estimate is the observation.
 
-    The result may be negative. It is NaN where the image is not finite. Raises the same errors as `problem.pose`.
+    The result may be negative. It is NaN where the image is not finite.
     """
-    problem = pose(METHOD, image, psf, conditions, steps=steps, stop=stop)
-    result = problem.solve(Additive(problem, inverse_filter(problem.engine)))
-    sample = transfer_sample(problem.engine)
-    g = np.conj(sample.values) / np.maximum(np.abs(sample.values) ** 2, LEAST_TRANSFER**2)
-    return replace(result, noise_amplification=noise_amplification(sample, g, result.steps_done))
+    from psfcore.deconvolve.iterations.linear import solve
 
-
-def inverse_filter(engine: Engine) -> NDArray[np.float32]:
-    """Compute G of Eq. (1) in the layout of the engine's transfer function."""
-    scale = np.float32(engine.transfer_scale)
-    power = np.square(engine.transfer).sum(axis=2, keepdims=True) * scale**2
-    g = engine.transfer / np.maximum(power, np.float32(LEAST_TRANSFER**2))
-    if not engine.symmetric:
-        g[:, :, 1] *= -1
-    return g
-
-
-class LinearIteration(Iteration):
-    """What the iterations of linear methods share: x_0 = y, and y without the masked pixels."""
-
-    def __init__(self, problem: Problem) -> None:
-        domain, engine = problem.domain, problem.engine
-        self.engine, self.judgement = engine, problem.judgement
-        self.x = engine.to_lanes(first_estimate(problem))
-        trusted = np.where(domain.trusted, domain.pixels, np.float32(np.nan))
-        self.observed = engine.to_lanes(trusted, padding=np.nan)
-        self.moved, self.total = np.zeros((2, engine.row_blocks))  # sums of (change)^2 and x^2
-        engine.rows_forward(self.x)
-
-
-class Additive(LinearIteration):
-    """The iteration of Eq. (1).
-
-    step_filter: G, divided by `engine.transfer_scale`, in the layout of `engine.transfer`. A constant G is
-    `np.full_like(engine.transfer[:, :, :1], G / engine.transfer_scale)`.
-    """
-
-    def __init__(self, problem: Problem, step_filter: NDArray[np.float32]) -> None:
-        super().__init__(problem)
-        self._step_filter = step_filter
-
-    def measure(self) -> None:
-        self.engine.columns(adjoint=False)
-        self.engine.row_stage(_residual_rows, self.observed, *self.judgement.numbers, _all_rows(self.engine))
-
-    def update(self, *, last: bool) -> None:
-        self.engine.multiply_columns(self._step_filter)
-        self.engine.row_stage(_add_rows, self.x, not last, self.moved, self.total, _all_rows(self.engine))
-        self.change = relative_change(self.moved.sum(), self.total.sum())
-
-
-def _all_rows(engine: Engine) -> int:
-    """The number of rows of a field with those that complete its last block."""
-    return engine.row_blocks * BLOCK_ROWS
-
-
-def solve_linear(
-    engine: Engine, step_filter: NDArray[np.float32], observed: Single, start: Single, steps: int
-) -> Single:
-    """x after some steps of Eq. (1), for an observation whose pixels are all trusted; in the engine's layout.
-
-    start: the first estimate. The scene is dark beyond the edges of the field. step_filter: as for `Additive`.
-    """
-    x, rows = start.copy(), engine.field_shape[0]
-    moved, total, sums = np.zeros((3, engine.row_blocks))
-    none = np.zeros((engine.row_blocks, 2, LANES), np.float32)  # no pixel is judged
-    engine.rows_forward(x)
-    for left in reversed(range(steps)):
-        engine.columns(adjoint=False)
-        engine.row_stage(_residual_rows, observed, none, 0, 0, np.float32(0), np.float32(1), sums, rows)
-        engine.multiply_columns(step_filter)
-        engine.row_stage(_add_rows, x, left > 0, moved, total, rows)
-    return x
-
-
-@dataclass(frozen=True, eq=False)
-class TransferSample:
-    """Values of T at some frequencies (float64 or complex128) and the weights of these frequencies, which sum to 1."""
-
-    values: NDArray[np.floating] | NDArray[np.complexfloating]
-    weights: NDArray[np.float64]
-
-
-def transfer_sample(engine: Engine) -> TransferSample:
-    """A sample of an engine's transfer function: along y, every k-th frequency (k: first radix of its transform)."""
-    rows = engine.column_plan.length // int(engine.column_plan.radices[0])
-    lanes = engine.transfer[:, :rows].astype(np.float64) * engine.transfer_scale
-    values = lanes[:, :, 0] if engine.symmetric else lanes[:, :, 0] + 1j * lanes[:, :, 1]
-    # Frequencies along x run from 0 to L / 2. Except the first and last, each also represents its negative.
-    k, half = np.arange(engine.column_blocks * LANES), engine.row_plan.length // 2
-    times = np.where((k == 0) | (k == half), 1.0, np.where(k < half, 2.0, 0.0))
-    weights = np.broadcast_to(times.reshape(-1, 1, LANES), values.shape)
-    used = weights > 0
-    return TransferSample(values[used], weights[used] / weights[used].sum())
-
-
-def noise_amplification(
-    sample: TransferSample, step: NDArray[np.floating] | NDArray[np.complexfloating], steps: int
-) -> float:
-    """Rms noise of the estimate after `steps` steps, divided by the rms noise of the image. step: G of Eq. (2)."""
-    # The closed form A_n = (1 - (1 - G T)^n (1 - T)) / T fails for T near 0.
-    gain = np.ones_like(sample.values)
-    for _ in range(steps):
-        gain = gain + step * (1 - sample.values * gain)  # Eq. (2)
-    return float(np.sqrt(np.sum(sample.weights * np.abs(gain) ** 2)))
-
-
-@compiled(fastmath={"contract", "reassoc"})
-def _residual_rows(spectrum, observed, judged, first, last, slope, ground, sums, rows, buffer, corner, start, stop, length, passes, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Replace H x by w (y - H x), where y is NaN if w is 0. Add up (y - H x)^2 / variance over the judged pixels.
-
-    The result is 0 beyond the number of rows.
-    """
-    nx = observed.shape[1]
-    zero, least = np.float32(0.0), np.float32(1e-30)
-    z = buffer.reshape((-1, 2, LANES))
-    for block in range(start, stop):
-        buffer_from_spectrum(spectrum, buffer, corner, block, length, place)
-        inverse(buffer, length, passes, lengths, tw, offsets)
-        sum_here = 0.0
-        for i in range(nx):
-            sum_row = zero
-            for side in range(2):
-                for w in range(LANES):
-                    y, model = observed[block, i, side, w], z[i, side, w]
-                    misfit = y - model if y == y else zero
-                    variance = max(slope * max(model, zero) + ground, least)
-                    sum_row += judged[block, side, w] * misfit * misfit / variance
-                    z[i, side, w] = misfit
-            if first <= i < last:
-                sum_here += sum_row
-        sums[block] = sum_here
-        _clear_beyond(z, rows - block * 2 * LANES, nx)
-        buffer[nx * 2 * LANES : length * 2 * LANES] = zero
-        forward(buffer, length, passes, lengths, tw, offsets)
-        spectrum_from_buffer(spectrum, buffer, corner, block, length, place)
-
-
-@compiled(fastmath={"contract", "reassoc"})
-def _add_rows(spectrum, x, again, moved, total, rows, buffer, corner, start, stop, length, passes, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Compute x <- x + G w (y - H x), Eq. (1). Add up (change)^2 and x^2 for each block. x is 0 beyond the number of rows."""
-    nx = x.shape[1]
-    zero = np.float32(0.0)
-    z = buffer.reshape((-1, 2, LANES))
-    for block in range(start, stop):
-        buffer_from_spectrum(spectrum, buffer, corner, block, length, place)
-        inverse(buffer, length, passes, lengths, tw, offsets)
-        moved_here, total_here = 0.0, 0.0
-        for i in range(nx):
-            moved_row, total_row = zero, zero
-            for side in range(2):
-                for w in range(LANES):
-                    change = z[i, side, w]
-                    value = x[block, i, side, w] + change  # Eq. (1)
-                    x[block, i, side, w] = value
-                    z[i, side, w] = value
-                    moved_row += change * change
-                    total_row += value * value
-            moved_here += moved_row
-            total_here += total_row
-        moved[block], total[block] = moved_here, total_here
-        _clear_beyond(z, rows - block * 2 * LANES, nx)
-        _clear_beyond(x[block], rows - block * 2 * LANES, nx)
-        if again:
-            buffer[nx * 2 * LANES : length * 2 * LANES] = zero
-            forward(buffer, length, passes, lengths, tw, offsets)
-            spectrum_from_buffer(spectrum, buffer, corner, block, length, place)
-
-
-@compiled()
-def _clear_beyond(z, rows, nx):  # type: ignore[no-untyped-def]
-    """Set the rows of a block beyond the number of rows to 0."""
-    for row in range(max(rows, 0), 2 * LANES):
-        for i in range(nx):
-            z[i, row // LANES, row % LANES] = np.float32(0.0)
+    return solve(problem)

@@ -1,4 +1,7 @@
-"""Find methods by name: each file of this package that has a constant METHOD holds a method."""
+"""Find methods by name: each file of this package with a constant METHOD and a function `deconvolve` is a method.
+
+This module loads no numerical library; a method loads its iteration when it runs.
+"""
 
 from __future__ import annotations
 
@@ -6,40 +9,53 @@ import pkgutil
 from collections.abc import Callable
 from functools import cache
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import psfcore.deconvolve.methods
-from psfcore.deconvolve.conditions import Deconvolved
-from psfcore.deconvolve.problem import Method
+from psfcore.deconvolve.declaration import Method
 from psfcore.errors import DataError
+
+if TYPE_CHECKING:
+    from psfcore.deconvolve.conditions import Conditions, Deconvolved
+    from psfcore.image import Image
+    from psfcore.psf import Psf
+
+DEFAULT = "richardson-lucy"
 
 
 def method_named(name: str) -> Callable[..., Deconvolved]:
-    """The function `deconvolve(image, psf, conditions, **parameters)` of a method.
+    """The function `deconvolve(image, psf, conditions, *, stop="fixed", **parameters)` of a method.
 
     Raises DataError "unknown-method", whose message lists the known methods.
     """
-    deconvolve: Callable[..., Deconvolved] = _module_of(name).deconvolve
+    method = properties_of(name)
+
+    def deconvolve(
+        image: Image, psf: Psf, conditions: Conditions, *, stop: str = "fixed", **parameters: Any
+    ) -> Deconvolved:
+        from psfcore.deconvolve.problem import pose
+
+        values = method.complete(parameters)
+        problem = pose(method, image, psf, conditions, steps=values.pop("steps"), stop=stop)
+        estimated: Deconvolved = _modules()[name].deconvolve(problem, **values)
+        return estimated
+
     return deconvolve
 
 
 def properties_of(name: str) -> Method:
     """The properties of a method. Raises DataError "unknown-method"."""
-    properties: Method = _module_of(name).METHOD
+    if name not in _modules():
+        raise DataError(
+            "unknown-method", f"expected one of the methods {', '.join(sorted(_modules()))}; got {name!r}"
+        )
+    properties: Method = _modules()[name].METHOD
     return properties
 
 
 def method_names() -> list[str]:
-    """The names of all methods."""
-    return sorted(_modules())
-
-
-def _module_of(name: str) -> Any:
-    if name not in _modules():
-        raise DataError(
-            "unknown-method", f"expected one of the methods {', '.join(method_names())}; got {name!r}"
-        )
-    return _modules()[name]
+    """The names of all methods, those of the family of the default method first."""
+    return sorted(_modules(), key=lambda name: (not name.startswith(DEFAULT), name))
 
 
 @cache

@@ -8,7 +8,7 @@ import numpy as np
 
 from psfcore.convolution.convolver import linear_convolve
 from psfcore.deconvolve.conditions import Conditions, Deconvolved, Progress
-from psfcore.deconvolve.methods.richardson_lucy import deconvolve
+from psfcore.deconvolve.methods.registry import method_named
 from psfcore.image import Image
 from psfcore.psf import Psf, crop_centred
 from psfcore.scatter.power_law import scatter_kernel
@@ -27,4 +27,4 @@ def richardson_lucy(
 ) -> Deconvolved:
     """The published method: a fixed number of steps, and a scene that is zero beyond the field."""
     conditions = Conditions(edges="zero", threads=threads, progress=progress)
-    return deconvolve(image, psf, conditions, steps=steps)
+    return method_named("richardson-lucy")(image, psf, conditions, steps=steps)

@@ -21,9 +21,9 @@ from workers.contract.identities import (
     request_identity,
 )
 from workers.contract.requests import (
+    METHOD_MODELS,
     CrossValidate,
     GapDiagnose,
-    Linear,
     Parameters,
     PsfBuild,
     PsfFit,
@@ -35,7 +35,6 @@ from workers.contract.requests import (
     ResolvedGapDiagnose,
     ResolvedPsfFit,
     ResolvedReport,
-    RichardsonLucy,
 )
 
 A, B, T = "a" * 64, "b" * 64, "c" * 64
@@ -71,7 +70,7 @@ def test_everything_that_changes_the_result_changes_the_identity(monkeypatch: py
         identity(error_draws=8),
         identity(other_channel=True),
     }
-    monkeypatch.setattr(RichardsonLucy, "algorithm_version", RichardsonLucy.algorithm_version + 1)
+    monkeypatch.setattr(METHOD_MODELS["richardson-lucy"], "algorithm_version", 99)
     others.add(identity())
     assert len(others) == 10 and base not in others
 
@@ -147,8 +146,8 @@ FROZEN: list[tuple[Callable[[], str], str]] = [
 
 # With these versions the ids were computed. Whoever raises a version wants other ids, and need not change this test.
 VERSIONS: dict[type[Parameters], int] = {
-    RichardsonLucy: 2,
-    Linear: 1,
+    METHOD_MODELS["richardson-lucy"]: 2,
+    METHOD_MODELS["linear"]: 1,
     PsfBuild: 2,
     PsfFit: 1,
     CrossValidate: 2,

@@ -24,7 +24,7 @@ from workers.catalogue.psfs import StatusAsked
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, TransitRow
 from workers.contract.identities import psf_identity
 from workers.contract.kinds import JobRequest, Kind, Result
-from workers.contract.requests import Parameters, PsfBuild, PsfFit, ResolvedDeconvolve, RichardsonLucy
+from workers.contract.requests import Parameters, PsfBuild, PsfFit, ResolvedDeconvolve
 from workers.intake import requests
 from workers.intake.compatibility import check, details_now, suits
 from workers.intake.requests import Asked, resolve_by_ids
@@ -59,7 +59,7 @@ def psf_of(
 
 
 def request(**more: Any) -> ResolvedDeconvolve:
-    return ResolvedDeconvolve(image_id="0" * 64, psf_id="1" * 64, method=RichardsonLucy(), **more)
+    return ResolvedDeconvolve(image_id="0" * 64, psf_id="1" * 64, **more)
 
 
 def refusal(wanted: ResolvedDeconvolve, psf: PsfRow | None, header: dict[str, Any]) -> DataError:

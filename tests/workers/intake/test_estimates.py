@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 import uuid
+from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
 from typing import Any
@@ -12,7 +13,8 @@ from typing import Any
 import pytest
 from sqlalchemy import delete
 
-from psfcore.deconvolve.extent import MARGIN_SHARE, WORKING_BYTES
+from psfcore.deconvolve.methods import linear
+from psfcore.deconvolve.methods.registry import method_names, properties_of
 from psfcore.errors import DataError
 from psfcore.instruments.model import parse_instrument
 from psfcore.instruments.workload import check_workload
@@ -23,7 +25,7 @@ from tests.workers.psf_examples import refused
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ImageRow, JobRow, TransitRow
 from workers.contract.jobs import Phase
-from workers.contract.requests import Method, PsfBuild, RichardsonLucy
+from workers.contract.requests import METHOD_MODELS, PsfBuild
 from workers.intake import estimates
 from workers.intake.costs import COSTS
 from workers.intake.estimates import BOUNDS, FEWEST_JOBS, KEEP_FACTOR_S, checked, estimate
@@ -44,7 +46,7 @@ def psf(catalogue: Catalogue, px: int, **details: Any) -> str:
 
 
 def deconvolution(catalogue: Catalogue, px: int = 1024, **changes: Any) -> dict[str, Any]:
-    method = RichardsonLucy().model_dump(mode="json") | changes.pop("method", {})
+    method = METHOD_MODELS["richardson-lucy"]().model_dump(mode="json") | changes.pop("method", {})
     wanted = {"image_id": image(catalogue, px), "psf_id": psf(catalogue, 512), "psf_recipe": None}
     return {**wanted, "method": method, "error_draws": 0, **changes}
 
@@ -57,15 +59,15 @@ def needs(
 
 
 def test_the_figures_are_those_of_known_methods() -> None:
-    names = {kind.model_fields["name"].annotation.__args__[0] for kind in Method.__args__[0].__args__}  # type: ignore[attr-defined]
-    assert set(COSTS.kinds.deconvolve.step_ns) == set(MARGIN_SHARE) == set(WORKING_BYTES) <= names
+    assert set(COSTS.kinds.deconvolve.step_ns) == set(method_names())
 
 
 def test_a_method_without_figures_is_slow(catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
     slowest = deconvolution(catalogue, method={"name": "richardson-lucy-total-variation", "steps": 20})
     expected = needs(catalogue, "deconvolve", slowest)
-    for figures in (MARGIN_SHARE, WORKING_BYTES):
-        monkeypatch.setitem(figures, "linear", figures["richardson-lucy-total-variation"])
+    like = properties_of("richardson-lucy-total-variation")
+    figures = {name: getattr(like, name) for name in ("margin_of_psf", "plane_bytes", "transform_bytes")}
+    monkeypatch.setattr(linear, "METHOD", replace(linear.METHOD, **figures))
     monkeypatch.delitem(COSTS.kinds.deconvolve.step_ns, "linear")
     unknown = deconvolution(catalogue, method={"name": "linear", "steps": 20})
     assert needs(catalogue, "deconvolve", unknown) == expected

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from psfcore.convolution.convolver import Convolver, linear_convolve
 from psfcore.deconvolve.conditions import Conditions, PreparedPsfs
 from psfcore.deconvolve.edges import band_px, share_from_beyond
+from psfcore.deconvolve.iterations.richardson_lucy_total_variation import SOFTENING
 from psfcore.deconvolve.methods import registry
 from psfcore.deconvolve.methods.registry import method_named, method_names, properties_of
-from psfcore.deconvolve.methods.richardson_lucy_total_variation import SOFTENING
 from psfcore.errors import DataError
 from psfcore.image import MaskBit
 from psfcore.noise import Noise
@@ -52,7 +52,7 @@ def seen(psf: Psf) -> Plane:
 def test_method_names_follow_the_files() -> None:
     folder = Path(registry.__file__).parent
     files = {path.stem.replace("_", "-") for path in folder.glob("*.py")} - {"registry", "--init--"}
-    assert len(files) >= 6 and sorted(files) == METHODS
+    assert len(files) >= 6 and sorted(files) == sorted(METHODS)
     for name in ("lucy", "result", "conditions", "Linear", "richardson_lucy", "../linear", ""):
         with pytest.raises(DataError, match=r"unknown-method: .*richardson-lucy-extended"):
             method_named(name)
@@ -310,7 +310,7 @@ REFUSALS = [
     *((name, DARK, {}, {}, "no-signal") for name in METHODS),
     *((name, -ONES, {}, {}, "no-signal") for name in POSITIVE),
     *((name, ONES, {}, {"steps": 0}, "bad-steps") for name in METHODS),
-    *((name, ONES, {}, {"steps": 10_001}, "bad-steps") for name in METHODS),
+    *((name, ONES, {}, {"steps": 1001}, "bad-steps") for name in METHODS),
     *((name, ONES, {}, {"stop": "soon"}, "bad-stop") for name in METHODS),
     *((name, ONES, {}, {"stop": "discrepancy"}, "no-noise-model") for name in METHODS),
     *((name, ONES, {"edges": "open"}, {}, "bad-edges") for name in METHODS),

@@ -1,0 +1,94 @@
+"""How a method of deconvolution declares itself: its parameters, its assumption about edges, and the memory that it needs.
+
+Requests, options of commands, forms of pages and estimates are made from these objects. This module loads no numerical library,
+because the web process uses it too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from psfcore.errors import DataError
+
+Edges = Literal["zero", "symmetric", "extended"]
+Stop = Literal["fixed", "discrepancy"]
+Value = int | float
+MOST_STEPS = 1000  # far beyond the point from which steps fit the noise
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A number that a method takes, from ``least`` to ``most``. about: what it means, for a description."""
+
+    name: str
+    default: Value
+    least: Value
+    most: Value
+    about: str | None = None
+
+    @property
+    def type(self) -> type[Value]:
+        """int or float, that of the default."""
+        return type(self.default)
+
+    @property
+    def values(self) -> tuple[Value, ...]:
+        """All values, if these are two whole numbers: a choice rather than a range."""
+        two = self.type is int and self.most == self.least + 1
+        return (self.least, self.most) if two else ()
+
+    def checked(self, value: Any) -> Any:
+        """The value. Raises DataError "bad-NAME" if it is outside the limits."""
+        if not self.least <= value <= self.most:
+            expected = f"{self.least} to {self.most} {self.name}"
+            raise DataError(f"bad-{self.name}", f"expected {expected}; got {value}")
+        return value
+
+
+def steps(default: int, about: str | None = None) -> Parameter:
+    """The number of steps, a parameter of every method."""
+    return Parameter("steps", default, 1, MOST_STEPS, about)
+
+
+@dataclass(frozen=True)
+class Method:
+    """A method of deconvolution, except its iteration.
+
+    use: for which images it is good, in the first sentence, and what must be known about it. algorithm_version: raise it when the
+    same parameters give another result. edges: the default assumption about the scene beyond the edges. margin_share: largest
+    share of its light that a pixel at the edge may get from beyond the margin; `psfcore.deconvolve.edges.margin_for` computes the
+    default width of the margin from it. may_be_negative: whether results can be negative. keeps_flux: whether the steps conserve
+    the flux of the plane, and so compensate for light that leaves it (`psfcore.deconvolve.work`).
+
+    For estimates, measured by `python -m benchmarks.growth memory`; None: not measured, so the largest figure of all methods
+    counts. margin_of_psf: default margin divided by half the width of the PSF. plane_bytes, transform_bytes: see Eq. (1) of
+    `psfcore.deconvolve.extent`.
+    """
+
+    name: str
+    use: str
+    edges: Edges
+    margin_share: float
+    parameters: tuple[Parameter, ...]
+    algorithm_version: int = 1
+    may_be_negative: bool = False
+    keeps_flux: bool = False
+    margin_of_psf: float | None = None
+    plane_bytes: float | None = None
+    transform_bytes: float | None = None
+
+    def complete(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """The value of each parameter: the given one, or its default.
+
+        Raises DataError "unknown-parameter", and "bad-NAME" for a value outside its limits.
+        """
+        known = {one.name: one for one in self.parameters}
+        for name in given:
+            if name not in known:
+                names = ", ".join((*known, "stop"))
+                raise DataError(
+                    "unknown-parameter", f"expected parameters of {self.name}, {names}; got {name!r}"
+                )
+        return {name: one.checked(given.get(name, one.default)) for name, one in known.items()}

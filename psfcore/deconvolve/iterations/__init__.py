@@ -1,0 +1,1 @@
+"""The iterations of the methods, with their compiled kernels."""
