@@ -42,7 +42,7 @@ import heliopsf
 from benchmarks.bulk import make_archive, worked_through
 from benchmarks.figures import kind_of_machine, tell
 from benchmarks.timing import THREADS, answer_of, memory_bytes, reference, seconds
-from psfcore.deconvolve.extent import Demand, deconvolution_bytes
+from psfcore.deconvolve.memory import Demand, deconvolution_bytes
 from psfcore.deconvolve.methods.registry import method_names
 from psfcore.psf import central_part
 from psfcore.scatter.fit import fit_transit

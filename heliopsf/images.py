@@ -28,11 +28,11 @@ from heliopsf.inputs import (
 from heliopsf.outputs import Deconvolution, in_form_of
 from heliopsf.parameters import NoiseFigures, Number, Progress, Steps, noise_of, number, reporter, whole
 from heliopsf.psfs import AnyPsf, Psf, built_psf, given_psf
+from psfcore.deconvolve.box import LARGEST_ERROR
 from psfcore.deconvolve.camera_noise import measured_noise
 from psfcore.deconvolve.conditions import PreparedPsfs
 from psfcore.deconvolve.doubts import input_warnings
 from psfcore.deconvolve.edges import Edges
-from psfcore.deconvolve.extent import LARGEST_ERROR
 from psfcore.deconvolve.methods.registry import properties_of
 from psfcore.deconvolve.run import BUILDING, DECONVOLVING, read_and_deconvolve
 from psfcore.deconvolve.work import Options

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from heliopsf.parameters import COUNTS, level_dn
 from heliopsf.psfs import existing_file
-from psfcore.deconvolve.extent import Box
+from psfcore.deconvolve.box import Box
 from psfcore.errors import DataError, DataWarning
 from psfcore.fits.blocks import LIMITS
 from psfcore.fits.cards import card_trouble, long_key, number_of, plain_value

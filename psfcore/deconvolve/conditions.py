@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.convolution.engine import Engine
+from psfcore.deconvolve.box import Box
 from psfcore.deconvolve.edges import Edges
-from psfcore.deconvolve.extent import Box
 from psfcore.errors import DataError
 from psfcore.fits.cards import Cards
 from psfcore.image import Image

@@ -64,7 +64,7 @@ class Method:
 
     For estimates, measured by `python -m benchmarks.growth memory`; None: not measured, so the largest figure of all methods
     counts. margin_of_psf: default margin divided by half the width of the PSF. plane_bytes, transform_bytes: see Eq. (1) of
-    `psfcore.deconvolve.extent`.
+    `psfcore.deconvolve.memory`.
     """
 
     name: str

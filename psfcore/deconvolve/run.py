@@ -21,8 +21,8 @@ from psfcore.deconvolve.assess.changes import MEANINGS
 from psfcore.deconvolve.assess.ranks import percentiles
 from psfcore.deconvolve.conditions import Deconvolved, PreparedPsfs, Progress
 from psfcore.deconvolve.doubts import input_warnings
-from psfcore.deconvolve.extent import EXPECTED_RIM_PX, Demand, check_memory, product_bytes
 from psfcore.deconvolve.kernels import compiling_beside
+from psfcore.deconvolve.memory import EXPECTED_RIM_PX, Demand, check_memory, product_bytes
 from psfcore.deconvolve.problem import no_noise_model
 from psfcore.deconvolve.summary import assumptions
 from psfcore.deconvolve.work import Assessed, BoxWork, Options, Work, box_work

@@ -24,8 +24,8 @@ from pydantic import TypeAdapter, ValidationError
 from psfcore import limited
 from psfcore.compiled import listening
 from psfcore.deconvolve import run
+from psfcore.deconvolve.box import Box
 from psfcore.deconvolve.conditions import PreparedPsfs
-from psfcore.deconvolve.extent import Box
 from psfcore.deconvolve.run import BUILDING, Identities, UsedPsf
 from psfcore.errors import DataError, module_of_extra
 from psfcore.files import sha256_of

@@ -14,14 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Union
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model, model_validator
 
 from psfcore.deconvolve import declaration
+from psfcore.deconvolve.box import BOX, LARGEST_ERROR, Box, region_without_discrepancy, region_without_errors
 from psfcore.deconvolve.declaration import Edges, Stop
-from psfcore.deconvolve.extent import (
-    BOX,
-    LARGEST_ERROR,
-    Box,
-    region_without_discrepancy,
-    region_without_errors,
-)
 from psfcore.deconvolve.methods.registry import DEFAULT, method_names, properties_of
 from psfcore.errors import DataError
 from psfcore.instruments.model import MOST_BYTES

@@ -33,7 +33,7 @@ class Linear(_Frozen):
 
 
 class Deconvolution(_Frozen):
-    """Time of a deconvolution. The plane is the image with its margins. `psfcore.deconvolve.extent` has the memory.
+    """Time of a deconvolution. The plane is the image with its margins. `psfcore.deconvolve.memory` has the memory.
 
     step_ns: for each method, the time of one step for one pixel of the plane, ns.
     """

@@ -20,7 +20,8 @@ from statistics import median_low
 from typing import Any
 from weakref import WeakKeyDictionary
 
-from psfcore.deconvolve.extent import EXPECTED_RIM_PX, MIB, Box, Demand, product_bytes
+from psfcore.deconvolve.box import Box
+from psfcore.deconvolve.memory import EXPECTED_RIM_PX, MIB, Demand, product_bytes
 from psfcore.errors import DataError
 from psfcore.instruments.model import parse_instrument
 from psfcore.instruments.workload import workload

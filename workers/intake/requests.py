@@ -6,7 +6,7 @@ import uuid
 from dataclasses import dataclass
 from typing import Any
 
-from psfcore.deconvolve.extent import Box
+from psfcore.deconvolve.box import Box
 from psfcore.fits.frame import frame_of
 from psfcore.fits.header import check_not_deconvolved
 from psfcore.gap.effect_sources import sha256_of_source

@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 
 from psfcore.convolution.convolver import Convolver
 from psfcore.deconvolve.assess.changes import QualityBit
-from psfcore.deconvolve.extent import Box
+from psfcore.deconvolve.box import Box
 from psfcore.deconvolve.methods.registry import method_names
 from psfcore.deconvolve.work import BoxWork, Options, Work, box_work
 from psfcore.errors import DataError

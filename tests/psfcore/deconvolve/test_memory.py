@@ -11,7 +11,7 @@ from astropy.io.fits import Header
 
 from psfcore.convolution.engine import Engine
 from psfcore.deconvolve.conditions import Conditions, PreparedPsfs, new_engine
-from psfcore.deconvolve.extent import MIB, Demand, check_memory, deconvolution_bytes
+from psfcore.deconvolve.memory import MIB, Demand, check_memory, deconvolution_bytes
 from psfcore.deconvolve.methods.registry import method_named, method_names
 from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits
