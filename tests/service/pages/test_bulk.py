@@ -78,7 +78,7 @@ def test_a_run_from_the_form_uses_its_method_and_steps_for_a_limited_number_of_i
     uploaded(api, tmp_path, 2)
     page = api.get("/bulk").text
     usual = dict(re.findall(r'<option value="([a-z-]+)">\1, usually (\d+) steps</option>', page))
-    assert next(iter(usual)) == "richardson-lucy" and usual["linear"] == "5" and 'max="200"' in page
+    assert next(iter(usual)) == "richardson-lucy" and usual["linear"] == "5" and 'max="1000"' in page
     monkeypatch.setattr(bulk_pages, "MOST_STARTED", 1)
     assert "the newest 1 of your images that have no product" in api.get("/bulk").text
     forms = (
@@ -196,7 +196,7 @@ def test_a_wrong_form_says_what_was_expected(api: TestClient, tmp_path: Path) ->
         (unknown, "There is no such PSF here"),
         ({"choice": "context:none"}, "none"),
         (unknown | {"name": "two\nlines"}, "Name: "),
-        (unknown | {"steps": "201"}, "Steps: Input should be less than or equal to 200"),
+        (unknown | {"steps": "1001"}, "Steps: Input should be less than or equal to 1000"),
         (unknown | {"method": "magic"}, "Method: expected name to be one of richardson-lucy"),
     ):
         refused = api.post("/bulk/start", data=fields)

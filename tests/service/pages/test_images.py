@@ -91,7 +91,7 @@ def test_a_refused_start_leads_back_with_its_options(api: TestClient, tmp_path: 
     answer = api.post(f"/images/{xrt}/start", data={**FORM, "again": "1"}, follow_redirects=False)
     assert answer.status_code == 303
     assert answer.headers["location"] == f"/images/{xrt}?method=richardson-lucy&steps=2&again=1"
-    assert 'name="steps" min="1" max="200" value="2"' in api.get(answer.headers["location"]).text
+    assert 'name="steps" min="1" max="1000" value="2"' in api.get(answer.headers["location"]).text
     assert api.get("/v1/jobs").json()["items"] == []
 
 

@@ -214,7 +214,7 @@ def test_the_fields_of_a_request_become_its_parameters() -> None:
 
 def test_an_input_has_the_limits_of_its_parameter() -> None:
     assert number_field("psf-build", "size") == 'type="number" name="size" min="64" max="4096" step="2"'
-    assert number_field("deconvolve", "steps") == 'type="number" name="steps" min="1" max="200"'
+    assert number_field("deconvolve", "steps") == 'type="number" name="steps" min="1" max="1000"'
 
 
 def test_a_wrong_parameter_is_named() -> None:
