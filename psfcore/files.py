@@ -24,7 +24,8 @@ CACHE_VARIABLE = "HELIOPSF_CACHE_DIR"
 PARTIAL = ".part"
 PACKED = (".fz", ".bz2", ".xz", ".z")  # endings that promise a compression which is not written
 PROBE_BYTES = 4096  # the block size of most file systems: if the disk is full, the probe cannot be written
-_GZIP_START, _GZIP_LEVEL = b"\x1f\x8b", 6  # the level of the program gzip
+GZIP_START = b"\x1f\x8b"
+_GZIP_LEVEL = 6  # that of the program gzip
 
 
 @contextmanager
@@ -88,7 +89,7 @@ def check_ending(target: Path) -> None:
 def _compress(path: Path) -> None:
     """Replace a file by the same content in gzip, without name and time: equal contents give equal files."""
     with path.open("rb") as plain:
-        if plain.read(2) == _GZIP_START:
+        if plain.read(2) == GZIP_START:
             return
         plain.seek(0)
         with whole_file(path) as file, gzip.GzipFile("", "wb", _GZIP_LEVEL, file, mtime=0) as packed:

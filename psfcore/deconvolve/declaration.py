@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any, Literal
 
 from psfcore.errors import DataError
@@ -40,10 +41,13 @@ class Parameter:
         return (self.least, self.most) if two else ()
 
     def checked(self, value: Any) -> Any:
-        """The value. Raises DataError "bad-NAME" if it is outside the limits."""
-        if not self.least <= value <= self.most:
-            expected = f"{self.least} to {self.most} {self.name}"
-            raise DataError(f"bad-{self.name}", f"expected {expected}; got {value}")
+        """The value. Raises DataError "bad-NAME" if it is no number of this type, or outside the limits."""
+        number = isinstance(value, Real) and (self.type is float or float(value).is_integer())
+        if not number or not self.least <= value <= self.most:
+            expected = (
+                f"{'a whole number' if self.type is int else 'a number'} from {self.least} to {self.most}"
+            )
+            raise DataError(f"bad-{self.name}", f"{self.name}: expected {expected}; got {value!r:.40}")
         return value
 
 

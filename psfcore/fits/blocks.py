@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
 from psfcore.errors import HeaderError
+from psfcore.files import GZIP_START
 from psfcore.fits.cards import (
     LARGEST_COUNT,
     bad_card,
@@ -34,7 +35,7 @@ from psfcore.fits.cards import (
     optional_text,
 )
 from psfcore.fits.compression import check_compression, check_counts
-from psfcore.fits.gzipped import GZIP_START, decompressed
+from psfcore.fits.gzipped import decompressed
 
 if TYPE_CHECKING:
     from astropy.io.fits import Header

@@ -12,7 +12,6 @@ from typing import Any, BinaryIO
 from psfcore.errors import HeaderError
 from psfcore.limited import run_limited, scratch_file
 
-GZIP_START = b"\x1f\x8b"
 _PIECE_BYTES = 1 << 20
 
 

@@ -14,11 +14,8 @@ from psfcore.fits.cards import without_cards
 from psfcore.fits.header import PRODUCT, HeaderSummary, read_summary
 from psfcore.limited import run_limited
 
-# Cards that describe the whole image and its storage, and would be wrong in a cut-out.
-_DROPPED = (
-    *("EXTEND", "CHECKSUM", "DATASUM", "DATAMIN", "DATAMAX", "DATAMEAN", "PCOUNT", "GCOUNT"),
-    *("BSCALE", "BZERO", "BLANK"),
-)
+# Cards that say how the file stores its image, and would be wrong in a cut-out.
+_STORAGE = ("EXTEND", "PCOUNT", "GCOUNT", "BSCALE", "BZERO", "BLANK")
 
 
 def check_is_psf(path: str | Path, summary: HeaderSummary, limits: FitsLimits) -> None:
@@ -66,17 +63,15 @@ def cut_psf(target: BinaryIO, *, path: str, size: int, limits: dict[str, int]) -
     from astropy.io import fits
 
     from psfcore.fits.hdus import read_pixels  # loads the numerical libraries
-    from psfcore.psf import crop_centred
+    from psfcore.fits.viewing.regions import moved_header
 
     stored = read_pixels(path, FitsLimits(**limits))
-    part = crop_centred(stored.pixels, (size, size))
-    cut = without_cards(stored.header, _DROPPED)
-    for axis, whole in ((1, stored.pixels.shape[1]), (2, stored.pixels.shape[0])):
-        if f"CRPIX{axis}" in cut:
-            cut[f"CRPIX{axis}"] -= whole // 2 - size // 2
+    ny, nx = stored.pixels.shape
+    rows, columns = (slice(n // 2 - size // 2, n // 2 - size // 2 + size) for n in (ny, nx))
+    part = stored.pixels[rows, columns]
+    cut = moved_header(without_cards(stored.header, _STORAGE), columns, rows)
     cut["PSFSUM"] = (math.fsum(part.ravel()), "sum of weights on this array")
     cut["REACH"] = (math.hypot(size // 2, size // 2), "[pixel] farthest pixel from the centre")
-    ny, nx = stored.pixels.shape
     cut.add_history(f"central {size} x {size} px of {nx} x {ny}, not renormalised")
     fits.HDUList([fits.PrimaryHDU(part.astype("f8" if stored.bits == -64 else "f4"), cut)]).writeto(target)
     return {}

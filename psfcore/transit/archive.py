@@ -21,7 +21,7 @@ from tempfile import TemporaryFile
 from typing import IO, BinaryIO, cast
 
 from psfcore.errors import DataError, together
-from psfcore.fits.gzipped import GZIP_START
+from psfcore.files import GZIP_START
 from psfcore.limited import run_limited
 from psfcore.transit.admission import ArchiveLimits, is_plain_name
 from psfcore.transit.manifest import MANIFEST_NAME, TransitManifest, parse_manifest, read_manifest

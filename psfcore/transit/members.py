@@ -20,7 +20,7 @@ from functools import partial
 from typing import IO, Any, BinaryIO, Literal, NamedTuple, cast
 
 from psfcore.errors import DataError
-from psfcore.fits.gzipped import GZIP_START
+from psfcore.files import GZIP_START
 from psfcore.transit.admission import (
     MANIFEST_NAME,
     MAX_MANIFEST_BYTES,

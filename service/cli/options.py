@@ -33,7 +33,7 @@ from service.cli.progress import echo
 from service.cli.progress import progress_bar as progress_bar
 from service.client.errors import ServiceError, error_lines
 from service.client.outputs import base_name, check_output_folder, check_outputs, written
-from workers.contract.requests import METHOD_MODELS, METHODS, Deconvolve, Option
+from workers.contract.requests import METHOD_MODELS, METHODS, Deconvolve, DefaultMethod, Option
 
 if TYPE_CHECKING:
     from psfcore.fits.blocks import FitsLimits
@@ -71,7 +71,7 @@ def methods_help() -> str:
 
 
 def _field(model: type[BaseModel], name: str) -> FieldInfo:
-    return model.model_fields.get(name) or METHOD_MODELS[METHODS[0]].model_fields[name]
+    return model.model_fields.get(name) or DefaultMethod.model_fields[name]
 
 
 def _option(model: type[BaseModel], name: str) -> Callable[[Command], Command]:
@@ -94,7 +94,7 @@ def _option(model: type[BaseModel], name: str) -> Callable[[Command], Command]:
     if kind is NoiseFigures:
         return click.option("--noise", nargs=2, type=float, metavar="GAIN READ", help=text)
     # The default of a parameter of a method depends on the method.
-    default = None if name in METHOD_MODELS[METHODS[0]].model_fields else field.default
+    default = None if name in DefaultMethod.model_fields else field.default
     return click.option(
         *names,
         type=_type(kind, field),
@@ -156,7 +156,7 @@ def _checked_by(check: Callable[[str], object]) -> Callable[..., str | None]:
 
 def _help(model: type[BaseModel], field: FieldInfo) -> str:
     """The description of the field with the names of options; what null means is the default."""
-    fields = model.model_fields.keys() | METHOD_MODELS[METHODS[0]].model_fields.keys()
+    fields = model.model_fields.keys() | DefaultMethod.model_fields.keys()
     text = _FALSE.sub("", field.description or "")
     begins_with_value = text.startswith("`")
     text = _QUOTED.sub(lambda word: _name(model, word[1]) if word[1] in fields else word[1], text)

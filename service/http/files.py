@@ -22,6 +22,7 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import FileResponse, Response
 from starlette.types import Receive, Scope, Send
 
+from psfcore.files import GZIP_START
 from psfcore.fits.header import HeaderSummary, read_summary
 from psfcore.fits.stored_psf import check_is_psf
 from psfcore.transit.archive import START_BYTES, archive_kind, could_be_archive, list_archive
@@ -39,7 +40,7 @@ from workers.intake.uploads import image_row, transit_row, uploaded_psf_row
 log = logging.getLogger(__name__)
 
 FITS_TYPE, GZIP_TYPE, JSON_TYPE = "application/fits", "application/gzip", "application/json"
-FITS_STARTS = (b"SIMPLE  =", b"\x1f\x8b")  # FITS, or FITS in gzip
+FITS_STARTS = (b"SIMPLE  =", GZIP_START)  # FITS, or FITS in gzip
 FORM_BYTES = 2**16  # largest size of a form without its file
 UNDECLARED_BYTES = 2**20  # bytes that are counted in one step if the request does not declare its length
 KEPT = "private, max-age=31536000, immutable"  # the content at an address never changes

@@ -20,7 +20,7 @@ from service.http.guard import check_text
 from service.http.problems import Problem
 from service.http.state import State
 from workers.contract.kinds import KINDS, JobRequest
-from workers.contract.requests import METHOD_MODELS, METHODS
+from workers.contract.requests import METHOD_MODELS, METHODS, DefaultMethod
 from workers.contract.suggestions import explained
 
 Sent = Mapping[str, str | UploadFile]
@@ -82,7 +82,7 @@ def number_field(kind: str, name: str) -> Markup:
     """The attributes of an input for a number of a request: its type, name and limits."""
     model = KINDS[kind].parameters
     assert model is not None
-    field = model.model_fields.get(name) or METHOD_MODELS[METHODS[0]].model_fields[name]
+    field = model.model_fields.get(name) or DefaultMethod.model_fields[name]
     limits = {_ATTRIBUTES[type(one)]: one for one in field.metadata if type(one) in _ATTRIBUTES}
     attributes = {attribute: getattr(one, limit) for (attribute, limit), one in limits.items()}
     return Markup(" ").join(

@@ -130,6 +130,7 @@ def _request_of(method: declaration.Method) -> type[_Method]:
 
 METHODS: list[str] = method_names()
 METHOD_MODELS: dict[str, type[_Method]] = {name: _request_of(properties_of(name)) for name in METHODS}
+DefaultMethod = METHOD_MODELS[DEFAULT]  # its fields are those that every method has
 if TYPE_CHECKING:
     Method = _Method
 else:
@@ -167,7 +168,7 @@ class PsfBuild(Parameters):
 class Treatment(Parameters):
     """How an image is deconvolved: the same for one image and for each image of a bulk run."""
 
-    method: Method = Field(default_factory=lambda: METHOD_MODELS[DEFAULT].model_validate({}))
+    method: Method = Field(default_factory=lambda: DefaultMethod.model_validate({}))
     noise: NoiseFigures | None = Field(
         None,
         description="photon gain (DN per photon), read noise (DN rms); null: published, else measured in the image",

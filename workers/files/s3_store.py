@@ -275,8 +275,8 @@ class RemoteStore(Store):
                 self._download(digest, partial)  # in any case, as in ``size``
             if sha256_of(partial) != digest:
                 self._download(digest, partial)  # the answer may have been wrong, and not the object
-            if sha256_of(partial) != digest:
-                raise BadFile("file-damaged", f"expected the file {digest} as it was stored; {DAMAGED}")
+                if sha256_of(partial) != digest:
+                    raise BadFile("file-damaged", f"expected the file {digest} as it was stored; {DAMAGED}")
             self._keep_copy(partial, copy)
 
     def _download(self, digest: str, to: Path) -> None:

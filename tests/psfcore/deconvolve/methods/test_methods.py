@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 
 import numpy as np
@@ -318,10 +319,10 @@ REFUSALS = [
     *((name, ONES, {}, {"stop": "soon"}, "bad-stop") for name in METHODS),
     *((name, ONES, {}, {"stop": "discrepancy"}, "no-noise-model") for name in METHODS),
     *((name, ONES, {"edges": "open"}, {}, "bad-edges") for name in METHODS),
-    *(("richardson-lucy-accelerated", ONES, {}, {"order": order}, "bad-order") for order in (0, 3)),
+    *(("richardson-lucy-accelerated", ONES, {}, {"order": order}, "bad-order") for order in (0, 3, 1.5, "2")),
     *(
         ("richardson-lucy-total-variation", ONES, {}, {"smoothing": k}, "bad-smoothing")
-        for k in (-0.01, 0.021)
+        for k in (-0.01, 0.021, math.nan, None)
     ),
 ]
 
