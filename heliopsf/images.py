@@ -34,7 +34,7 @@ from psfcore.deconvolve.conditions import PreparedPsfs
 from psfcore.deconvolve.doubts import input_warnings
 from psfcore.deconvolve.edges import Edges
 from psfcore.deconvolve.methods.registry import properties_of
-from psfcore.deconvolve.run import BUILDING, DECONVOLVING, read_and_deconvolve
+from psfcore.deconvolve.run import BUILDING, DECONVOLVING, PsfSource, read_and_deconvolve
 from psfcore.deconvolve.work import Options
 from psfcore.errors import DataError, DataWarning
 from psfcore.fits.frame import frame_of
@@ -196,8 +196,18 @@ def deconvolve(  # type: ignore[misc]  # the overloads need not repeat the optio
     def begin(stage: str, _steps: int) -> Steps | None:
         return reporter(progress if stage == DECONVOLVING else progress is True, stage)
 
-    prepared = PreparedPsfs()
-    given = None if psf is None else given_psf(psf, threads=options.threads, progress=begin(BUILDING, 1))
+    source = partial(
+        PsfSource,
+        possible_psfs=partial(possible_on_pixels, threads=options.threads),
+        plate_scale_arcsec=scale,
+        prepared=PreparedPsfs(),
+        other_channel=other_channel,
+    )
+    if psf is None:
+        of_image = source(partial(_built_for, threads=options.threads, parts=False))
+    else:
+        given = given_psf(psf, threads=options.threads, progress=begin(BUILDING, 1))
+        of_image = source(lambda *_: given, key=id(given), kernel_shape=given.kernel.shape)
 
     def one(image: Any) -> Any:
         box = None if region is None else box_of(region, image, hdu)
@@ -212,17 +222,12 @@ def deconvolve(  # type: ignore[misc]  # the overloads need not repeat the optio
 
         product, _ = read_and_deconvolve(
             read,
-            shape_of(image, hdu),
-            given,
+            of_image,
             replace(
                 options, region=box, noise=options.noise if sigma is None else measured_noise(read(), sigma)
             ),
-            build=partial(_built_for, threads=options.threads, parts=False),
-            possible_psfs=partial(possible_on_pixels, threads=options.threads),
-            prepared=prepared,
+            shape=shape_of(image, hdu),
             free_bytes=free_bytes(),
-            plate_scale_arcsec=scale,
-            other_channel=other_channel,
             again=again,
             clip=partial(_clipped, clip_negative=clip_negative, method=method),
             begin=begin,

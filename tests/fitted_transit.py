@@ -17,7 +17,7 @@ from tests.in_process import InProcess
 from tests.once_a_run import once_a_run
 from tests.transit_files import write_simulated
 from workers.settings import Settings
-from workers.tasks import transits
+from workers.tasks import solutions
 
 
 def fitted_transit(folders: pytest.TempPathFactory) -> Path:
@@ -56,7 +56,7 @@ def counted_inversions(images: list[int]) -> Iterator[None]:
         return solution
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(transits, "invert", counted)
+        patched.setattr(solutions, "invert", counted)
         yield
 
 

@@ -6,7 +6,7 @@ PSF and options. `write` writes it as a FITS file.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -28,12 +28,11 @@ from psfcore.deconvolve.summary import assumptions
 from psfcore.deconvolve.work import Assessed, BoxWork, Options, Work, box_work
 from psfcore.fits.channel import check_channel
 from psfcore.fits.frame import frame_of
-from psfcore.fits.header import known_instrument, optional_text, seen_by
+from psfcore.fits.header import known_instrument, optional_text
 from psfcore.fits.images import described, write_image
 from psfcore.fits.observation import check_exposure_of_sun
 from psfcore.fits.units import unit_label
 from psfcore.image import Image, MaskBit
-from psfcore.instruments.unknown import unknown_instrument
 from psfcore.psf import REACH_GRID_PX, Psf
 from psfcore.psf_sampling import with_scale
 
@@ -204,44 +203,57 @@ def deconvolve(
     )
 
 
+@dataclass(frozen=True)
+class PsfSource:
+    """The PSF of a deconvolution, which is read or built when it is needed.
+
+    load(header, progress): reads it, or builds it for an image with this header. possible_psfs(psf, header): variants of the PSF
+    within its errors, on the pixels of the image. key: the same for the same PSF; None: the PSF belongs to the telescope in
+    the header. kernel_shape: (ny, nx) of its kernel. plate_scale_arcsec: of a PSF that gives none. prepared: keeps PSFs and engines
+    between images. other_channel: see `input_warnings`. warnings: sentences about the PSF, by their codes.
+    """
+
+    load: Callable[[Header, Progress | None], Psf]
+    possible_psfs: Callable[[Psf, Header], Sequence[Psf]]
+    key: Hashable = None
+    kernel_shape: tuple[int, ...] = (REACH_GRID_PX, REACH_GRID_PX)
+    plate_scale_arcsec: float | None = None
+    prepared: PreparedPsfs = field(default_factory=PreparedPsfs)
+    other_channel: bool = False
+    warnings: Mapping[str, str] = field(default_factory=dict)
+
+
 def read_and_deconvolve(
     read: Callable[[], Image],
-    shape: tuple[int, int],
-    psf: Psf | None,
+    source: PsfSource,
     options: Options,
     *,
-    build: Callable[[Header, Progress | None], Psf],
-    possible_psfs: Callable[[Psf, Header], Sequence[Psf]],
-    prepared: PreparedPsfs,
-    free_bytes: int,
-    plate_scale_arcsec: float | None = None,
-    other_channel: bool = False,
+    shape: tuple[int, int] | None = None,
+    free_bytes: int = 0,
     again: bool = False,
-    seen_as: Callable[[Psf], Psf] = lambda psf: psf,
     clip: Callable[[Image], Image] = lambda image: image,
     begin: Callable[[str, int], Progress | None],
     say: Callable[[str, str], object] = lambda code, message: None,
 ) -> tuple[Product, Psf]:
-    """Check an image and its PSF, and deconvolve the image in this process. Returns also the PSF as it was built.
+    """Check an image and its PSF, and deconvolve the image in this process. Returns also the PSF as it was read or built.
 
-    read: reads the image; shape: its shape (ny, nx), known from its header. psf: None: build(header, progress) returns that of
-    the telescope. possible_psfs(psf, header): variants of the PSF within its errors, on the pixels of the image. prepared: keeps
-    PSFs and engines between images. free_bytes: the free memory. plate_scale_arcsec: of a PSF that gives none. other_channel:
-    see `input_warnings`. again: also deconvolve a product or a PSF. seen_as: adds to a PSF the instrument and wavelength that
-    its file does not name. clip: changes the pixels after the warnings were found; the product contains the unchanged image.
-    begin: see `deconvolve`. say(code, message): called for each warning before the work begins.
+    read: reads the image. shape: its shape (ny, nx), if known from its header; then the job must fit into the free memory,
+    free_bytes. again: also deconvolve a product or a PSF. clip: changes the pixels after the warnings were found; the product contains the unchanged
+    image. begin: see `deconvolve`. say(code, message): called for each warning before the work begins.
 
-    Raises DataError "too-much-memory", "no-psf-for-instrument", "plate-scale-known", "plate-scale-mismatch", "channel-mismatch"
-    and the errors of `check_exposure_of_sun` and `deconvolve`.
+    Raises DataError "too-much-memory", "plate-scale-known", "plate-scale-mismatch", "channel-mismatch" and the errors of
+    `check_exposure_of_sun`, of the source and of `deconvolve`.
     """
-    box = options.region
+    box, prepared = options.region, source.prepared
 
     def check_plane(plane: tuple[int, int]) -> None:
-        psf_shape = (REACH_GRID_PX, REACH_GRID_PX) if psf is None else psf.kernel.shape
+        if shape is None:
+            return
+        ny, nx = source.kernel_shape
         demand = Demand(
             options.method,
             plane,
-            (psf_shape[0], psf_shape[1]),
+            (ny, nx),
             edges=options.edges,
             margin_px=options.margin_px,
             draws=options.error_draws,
@@ -249,24 +261,26 @@ def read_and_deconvolve(
         check_memory(plane, product_bytes(demand, shape[0] * shape[1]), free_bytes)
 
     def as_built() -> Psf:
-        if psf is not None:
-            return with_scale(psf, plate_scale_arcsec)
+        if source.key is not None or shape is None:
+            return with_scale(source.load(header, None), source.plate_scale_arcsec)
         with compiling_beside(options.method, shape):
-            return with_scale(build(header, begin(BUILDING, 1)), plate_scale_arcsec)
+            return with_scale(source.load(header, begin(BUILDING, 1)), source.plate_scale_arcsec)
 
-    check_plane(shape if box is None else box.wider(EXPECTED_RIM_PX, shape).shape)
+    if shape is not None:
+        check_plane(shape if box is None else box.wider(EXPECTED_RIM_PX, shape).shape)
     image = read()
     header = image.header
     if not again:
         check_exposure_of_sun(header)
-    instrument, turn_deg = known_instrument(header), frame_of(header).turn_to_build_deg
-    if psf is None and instrument is None:
-        raise unknown_instrument(seen_by(header))
-    key = (id(psf) if psf is not None else (instrument, turn_deg), plate_scale_arcsec)
+    of_telescope = known_instrument(header), frame_of(header).turn_to_build_deg
+    key = (of_telescope if source.key is None else source.key, source.plate_scale_arcsec)
     whole = prepared.as_built(key, as_built)
-    check_channel(seen_as(whole), header, other_channel=other_channel)
+    check_channel(whole, header, other_channel=source.other_channel)
     fitted = prepared.on_pixels_of(header, key, as_built)
-    warnings = input_warnings(seen_as(fitted), image, options.method, other_channel=other_channel)
+    warnings = {
+        **source.warnings,
+        **input_warnings(fitted, image, options.method, other_channel=source.other_channel),
+    }
     for code, message in warnings.items():
         say(code, message)
     product = deconvolve(
@@ -274,7 +288,7 @@ def read_and_deconvolve(
         fitted,
         replace(options, engine_for=prepared.engine_for),
         warnings=warnings,
-        possible_psfs=lambda: possible_psfs(whole, header),
+        possible_psfs=lambda: source.possible_psfs(whole, header),
         begin=begin,
         check_plane=check_plane,
     )

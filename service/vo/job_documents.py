@@ -16,7 +16,7 @@ from service.vo.parameters import NO_XML
 from workers.catalogue.tables import JobRow, TermsRow
 from workers.catalogue.uws_jobs import JobLine
 from workers.contract.jobs import Fault, JobError, Phase
-from workers.contract.kinds import KINDS, Result
+from workers.contract.kinds import KINDS, ResultType
 
 MEDIA_TYPE = "application/xml"
 UWS = "http://www.ivoa.net/xml/UWS/v1.0"
@@ -79,7 +79,7 @@ def result_addresses(row: JobRow) -> dict[str, tuple[str, str]]:
     if row.phase != Phase.COMPLETED or row.result_id is None:
         return {}
     result = KINDS[row.kind].result
-    media_type = "application/json" if result == Result.REPORT else "application/fits"
+    media_type = "application/json" if result == ResultType.REPORT else "application/fits"
     return {
         "result": (f"{result}/{row.result_id}/file", media_type),
         "description": (f"{result}/{row.result_id}", "application/json"),

@@ -19,9 +19,9 @@ from workers.files.store import Store
 from workers.run.child import Stopping
 from workers.run.runner import Runner
 from workers.settings import Settings
-from workers.tasks.context import Context
+from workers.tasks.catalogue_workspace import CatalogueWorkspace
 
-Task = Callable[[Context, Mapping[str, Any]], str]
+Task = Callable[[CatalogueWorkspace, Mapping[str, Any]], str]
 
 
 def job_row(catalogue: Catalogue, job_id: str) -> JobRow:

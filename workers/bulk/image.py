@@ -27,11 +27,9 @@ from workers.files import archive as archive_files
 from workers.files.store import is_disk_full
 from workers.intake import estimates
 from workers.intake.compatibility import details_now
-from workers.rows import row_of
 from workers.tasks import deconvolve as deconvolve_task
-from workers.tasks.context import Context
-from workers.tasks.deconvolve import Made
-from workers.tasks.psf_build import requested_psf
+from workers.tasks.catalogue_workspace import CatalogueWorkspace
+from workers.tasks.workspace import Result
 
 # The changes of an image are summarised for blocks of 4 × 4 px: the brightest and the darkest 1 % of the blocks.
 BLOCK_PX, TAIL_PCT = 4, 1.0
@@ -73,73 +71,74 @@ class Ready:
     start_s: float
 
 
-def read_one(context: Context, bulk: BulkRow, item: BulkItemRow) -> Ready | Outcome:
+def read_one(workspace: CatalogueWorkspace, bulk: BulkRow, item: BulkItemRow) -> Ready | Outcome:
     """Read an image of a bulk run and choose its PSF. If its product exists already, return this product.
 
     If another job is making the product now, wait for that job and use its product. Raises DataError for an image
     that cannot be deconvolved, and OSError if the disk is full.
     """
-    settings, run = context.settings, BulkWork.model_validate(bulk.request)
-    with _source(context, item) as source:
-        request = resolved_image(bulk, source.sha256, source.summary, context.catalogue)
+    settings, run = workspace.settings, BulkWork.model_validate(bulk.request)
+    with _source(workspace, item) as source:
+        request = resolved_image(bulk, source.sha256, source.summary, workspace.catalogue)
         identity, target = product_identity(request), None
         if run.output is not None:
             target = outputs.target_of(run.output, settings, source, identity=identity, psf_id=request.psf_id)
             if item.attempts > 1:
                 outputs.remove_partials(target, settings)
         destination = Destination(identity, run, target)
-        before = done_before(context, destination)
+        before = done_before(workspace, destination)
         if before is None and run.output is not None and target is not None:
-            outputs.prepare(run.output, target, identity, settings, context.limits)
-        if before is None and run.keeps_products and _waited(context, identity):
-            before = done_before(context, destination)
+            outputs.prepare(run.output, target, identity, settings, workspace.limits)
+        if before is None and run.keeps_products and _waited(workspace, identity):
+            before = done_before(workspace, destination)
         if before is not None:
             return before
         needs = request.model_dump(mode="json") | {"image_shape": source.summary["shape"]}
-        expected = estimates.checked("deconvolve", needs, context.catalogue, context.owner, settings)
+        expected = estimates.checked("deconvolve", needs, workspace.catalogue, workspace.owner, settings)
         # The path is taken only now, because the store's local copy may have been removed during a wait.
-        image_file = source.copy or context.store.verified(source.sha256)
-        image = deconvolve_task.load(context, request, image_file)
+        image_file = source.copy or workspace.store.verified(source.sha256)
+        image = deconvolve_task.load(workspace, request, image_file)
         return Ready(request, image, destination, expected["start_s"])
 
 
-def compute_one(context: Context, ready: Ready) -> Made:
+def compute_one(workspace: CatalogueWorkspace, ready: Ready) -> Result:
     """Deconvolve an image that was read. Builds the PSF first if it does not exist. Raises DataError."""
-    psf_row = requested_psf(context, ready.request)
     preview = ready.destination.run.keeps_products
-    return deconvolve_task.make(context, ready.request, psf_row, ready.image, preview=preview)
+    return deconvolve_task.make(workspace, ready.request, lambda: ready.image, preview=preview)
 
 
-def write_one(context: Context, ready: Ready, made: Made) -> Outcome:
+def write_one(workspace: CatalogueWorkspace, ready: Ready, result: Result) -> Outcome:
     """Write a finished deconvolution as a product. Raises DataError "output-not-written", and OSError if the disk is full."""
     output, target = ready.destination.run.output, ready.destination.target
-    with context.store.temporary() as path:
-        deconvolve_task.write(made, path)
-        if ready.destination.run.keeps_products:
-            return _kept(context, deconvolve_task.keep(made, path), ready.destination, reused=False)
-        assert output is not None and target is not None
+    if ready.destination.run.keeps_products:
+        row = workspace.keep(result)
+        assert isinstance(row, ProductRow)
+        return _kept(workspace, row, ready.destination, reused=False)
+    assert output is not None and target is not None
+    with workspace.store.temporary() as path:
+        result.files["file"](path)
         sha256, size_bytes = sha256_of(path), path.stat().st_size
-        outputs.put(output, path, target, sha256, context.settings)
+        outputs.put(output, path, target, sha256, workspace.settings)
     return Outcome(
         image_sha256=ready.request.image_id,
         psf_id=ready.request.psf_id,
-        product_id=made.identity,
+        product_id=result.id,
         reused=False,
         kept=False,
         output=str(target),
         sha256=sha256,
         bytes=size_bytes,
-        score=made.found.artefacts.score,
-        statistics=statistics_of(made.details),
+        score=_score(result.details),
+        statistics=statistics_of(result.details),
     )
 
 
-def _waited(context: Context, identity: str) -> bool:
+def _waited(workspace: CatalogueWorkspace, identity: str) -> bool:
     """Wait while another job makes this product. Returns whether there was such a job."""
     waited = False
-    while context.catalogue.jobs.at_work_on(context.owner, identity):
+    while workspace.catalogue.jobs.at_work_on(workspace.owner, identity):
         waited = True
-        context.report("waiting for an equal job", 0, 1)  # raises an exception if the bulk run must stop
+        workspace.report("waiting for an equal job", 0, 1)  # raises an exception if the bulk run must stop
         _rest()
     return waited
 
@@ -149,33 +148,33 @@ def _rest() -> None:
 
 
 @contextmanager
-def _source(context: Context, item: BulkItemRow) -> Iterator[outputs.Source]:
+def _source(workspace: CatalogueWorkspace, item: BulkItemRow) -> Iterator[outputs.Source]:
     if item.uploaded:
-        row = row_of(context.catalogue, ImageRow, item.source, context.owner)
+        row = workspace.row(ImageRow, item.source)
         yield outputs.Source(row.id, row.summary, row.filename or "image")
         return
-    allowed = archive_files.roots(context.settings.bulk_roots)
+    allowed = archive_files.roots(workspace.settings.bulk_roots)
     path = archive_files.check_under(Path(item.source), allowed)
-    with context.store.temporary() as copy:
+    with workspace.store.temporary() as copy:
         try:
             with archive_files.opened(path, allowed) as file:
-                sha256 = archive_files.copy_hashed(file, copy, context.settings.max_upload_bytes)
+                sha256 = archive_files.copy_hashed(file, copy, workspace.settings.max_upload_bytes)
         except OSError as error:
             if is_disk_full(error):  # the copy cannot be written; the same error would occur for every image
                 raise
             raise archive_files.unreadable(error) from error
-        summary = dataclasses.asdict(read_summary(copy, context.limits))
+        summary = dataclasses.asdict(read_summary(copy, workspace.limits))
         yield outputs.Source(sha256, summary, path.name, path, copy)
 
 
-def done_before(context: Context, destination: Destination) -> Outcome | None:
+def done_before(workspace: CatalogueWorkspace, destination: Destination) -> Outcome | None:
     """The existing product, copied to the output folder if it is not there yet; None if there is no product."""
     target = destination.target
     if destination.run.keeps_products:
-        row = context.made(ProductRow, destination.identity)
-        return None if row is None else _kept(context, row, destination, reused=True)
-    find = context.catalogue.bulks.progress.done_before
-    earlier = find(context.owner, destination.identity, str(target))
+        row = workspace.made(ProductRow, destination.identity)
+        return None if row is None else _kept(workspace, row, destination, reused=True)
+    find = workspace.catalogue.bulks.progress.done_before
+    earlier = find(workspace.owner, destination.identity, str(target))
     if earlier is None or target is None or not target.is_file() or sha256_of(target) != earlier.sha256:
         return None
     columns = {name: getattr(earlier, name) for name in Outcome.__annotations__}
@@ -187,14 +186,16 @@ def done_before(context: Context, destination: Destination) -> Outcome | None:
     return Outcome(**columns | {"reused": True, "kept": False, "statistics": statistics})
 
 
-def _kept(context: Context, row: ProductRow, destination: Destination, *, reused: bool) -> Outcome:
+def _kept(
+    workspace: CatalogueWorkspace, row: ProductRow, destination: Destination, *, reused: bool
+) -> Outcome:
     """The outcome for a product that the service keeps."""
     output, target = destination.run.output, destination.target
     if output is not None and target is not None:
         there = target.is_file() and target.stat().st_size == row.bytes
         if not there or sha256_of(target) != row.file_sha256:
-            file = context.store.verified(row.file_sha256)
-            outputs.put(output, file, target, row.file_sha256, context.settings)
+            file = workspace.store.verified(row.file_sha256)
+            outputs.put(output, file, target, row.file_sha256, workspace.settings)
     return Outcome(
         image_sha256=row.image_id,
         psf_id=row.psf_id,
@@ -204,9 +205,13 @@ def _kept(context: Context, row: ProductRow, destination: Destination, *, reused
         output=None if target is None else str(target),
         sha256=row.file_sha256,
         bytes=row.bytes,
-        score=float(row.details["changes"]["artefacts"]["score"]),
-        statistics=statistics_of(details_now(context.catalogue, row)),
+        score=_score(row.details),
+        statistics=statistics_of(details_now(workspace.catalogue, row)),
     )
+
+
+def _score(details: Mapping[str, Any]) -> float:
+    return float(details["changes"]["artefacts"]["score"])
 
 
 def statistics_of(details: Mapping[str, Any]) -> dict[str, Any]:

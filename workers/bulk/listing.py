@@ -24,7 +24,7 @@ from workers.files import archive as archive_files
 from workers.settings import Settings
 
 if TYPE_CHECKING:
-    from workers.tasks.context import Context
+    from workers.tasks.catalogue_workspace import CatalogueWorkspace
 
 MOST_IMAGES = 1_000_000
 LIST_AT_ONCE = 200
@@ -51,17 +51,19 @@ class Place:
         return cls(stored["pattern"], names)
 
 
-def list_files(context: Context, bulk: BulkRow, added: Callable[[], None], stops: Callable[[], bool]) -> None:
+def list_files(
+    workspace: CatalogueWorkspace, bulk: BulkRow, added: Callable[[], None], stops: Callable[[], bool]
+) -> None:
     """Add the files that the patterns of a bulk run match to its images, from the place where an earlier search ended.
 
-    bulk: the row that ``Bulks.begin_listing`` returned for the lease of the context. added: called after images were
+    bulk: the row that ``Bulks.begin_listing`` returned for the lease of the workspace. added: called after images were
     added. stops: whether the search must end now; another turn then continues it. An error that concerns all files
     stops the run. Images that were added before it stay.
     """
-    bulks = context.catalogue.bulks
-    assert context.lease is not None
+    bulks = workspace.catalogue.bulks
+    assert workspace.lease is not None
     try:
-        if not _add_all(context, bulk, added, stops):
+        if not _add_all(workspace, bulk, added, stops):
             return
         now = bulks.get(bulk.id)
         if now is not None and now.total == 0:
@@ -69,7 +71,7 @@ def list_files(context: Context, bulk: BulkRow, added: Callable[[], None], stops
     except DataError as error:
         bulks.stop_with(bulk.id, JobError.of(error))
         return
-    bulks.end_listing(bulk.id, context.lease)
+    bulks.end_listing(bulk.id, workspace.lease)
 
 
 def no_images() -> DataError:
@@ -80,9 +82,11 @@ def no_images() -> DataError:
     )
 
 
-def _add_all(context: Context, bulk: BulkRow, added: Callable[[], None], stops: Callable[[], bool]) -> bool:
+def _add_all(
+    workspace: CatalogueWorkspace, bulk: BulkRow, added: Callable[[], None], stops: Callable[[], bool]
+) -> bool:
     """Search and add images in batches. Returns whether the search came to its end. Raises DataError."""
-    bulks, request, lease = context.catalogue.bulks, BulkWork.model_validate(bulk.request), context.lease
+    bulks, request, lease = workspace.catalogue.bulks, BulkWork.model_validate(bulk.request), workspace.lease
     assert lease is not None
     place = None if bulk.listed_to is None else Place.of(bulk.listed_to)
     several = place is not None and len(request.files) > 1
@@ -103,7 +107,7 @@ def _add_all(context: Context, bulk: BulkRow, added: Callable[[], None], stops: 
         return True
 
     try:
-        for reached, image in found_files(request, context.settings, place, known, bulk.total):
+        for reached, image in found_files(request, workspace.settings, place, known, bulk.total):
             place = reached
             if image is not None:
                 batch.append(image)

@@ -28,8 +28,8 @@ from workers.catalogue.tables import BulkItemRow, BulkRow
 from workers.contract.bulk import AT_WORK, BulkPhase, BulkWork
 from workers.contract.jobs import JobError
 from workers.stage_timer import STARTING
-from workers.tasks.context import Context, TurnOver
-from workers.tasks.deconvolve import Made
+from workers.tasks.catalogue_workspace import CatalogueWorkspace
+from workers.tasks.workspace import Result, TurnOver
 
 TELL_EVERY_S = 1.0  # interval at which a turn reports its progress and checks whether it must stop
 BETWEEN = "between images"  # the stage between two images: the worker checks whether the run continues
@@ -41,13 +41,13 @@ Answer = TypeVar("Answer")
 log = logging.getLogger(__name__)
 
 
-def bulk_turn(context: Context, parameters: Mapping[str, Any]) -> str:
+def bulk_turn(workspace: CatalogueWorkspace, parameters: Mapping[str, Any]) -> str:
     """Deconvolve images of a bulk run; returns the id of the run. Raises ``TurnOver`` if images are left but the turn must end."""
     bulk_id: str = parameters["bulk_id"]
-    bulk = context.catalogue.bulks.get(bulk_id)
+    bulk = workspace.catalogue.bulks.get(bulk_id)
     if bulk is not None and bulk.phase in AT_WORK:
         with ThreadPoolExecutor(4, "bulk") as pool:
-            turn = _Turn(context, bulk, pool)
+            turn = _Turn(workspace, bulk, pool)
             try:
                 turn.run()
             finally:
@@ -74,12 +74,12 @@ class _Turn:
     alone: an image that ends the process must not use up the attempts of its neighbours.
     """
 
-    def __init__(self, context: Context, bulk: BulkRow, pool: ThreadPoolExecutor) -> None:
-        self._context, self._bulk, self._pool = context, bulk, pool
-        self._bulks = context.catalogue.bulks
+    def __init__(self, workspace: CatalogueWorkspace, bulk: BulkRow, pool: ThreadPoolExecutor) -> None:
+        self._workspace, self._bulk, self._pool = workspace, bulk, pool
+        self._bulks = workspace.catalogue.bulks
         # Products name the bulk run as their job, because the job of a turn is soon deleted.
-        self._computing = dataclasses.replace(context, report=self._report, job_id=bulk.id)
-        self._beside = dataclasses.replace(context, report=self._check, job_id=bulk.id)
+        self._computing = dataclasses.replace(workspace, report=self._report, job_id=bulk.id)
+        self._beside = dataclasses.replace(workspace, report=self._check, job_id=bulk.id)
         self._stop, self._news = threading.Event(), threading.Event()
         self._ahead: _Reading | None = None
         self._writing: tuple[BulkItemRow, Future[None]] | None = None
@@ -106,7 +106,7 @@ class _Turn:
                 self._wait_for_images()
             elif self._is_at_work() and self._bulk.phase == BulkPhase.LISTING:
                 return  # another turn lists files
-            if time.monotonic() > self._ends_at or self._context.others_wait():
+            if time.monotonic() > self._ends_at or self._workspace.others_wait():
                 raise TurnOver
 
     def close(self) -> None:
@@ -128,8 +128,8 @@ class _Turn:
 
     def _stopped_for_quota(self) -> bool:
         """Stop the run if its owner's quota is used up. Returns whether it was stopped. The run can be resumed when there is room."""
-        context = self._context
-        usage = context.catalogue.owners.limited(context.owner, context.settings.quota_mib)
+        workspace = self._workspace
+        usage = workspace.catalogue.owners.limited(workspace.owner, workspace.settings.quota_mib)
         if usage is None or not usage.full:
             return False
         if not BulkWork.model_validate(self._bulk.request).keeps_products:
@@ -149,8 +149,8 @@ class _Turn:
             return True
         if self._listing is not None:
             self._listing.result()
-        assert self._context.lease is not None
-        bulk = self._bulks.begin_listing(self._bulk.id, self._context.lease)
+        assert self._workspace.lease is not None
+        bulk = self._bulks.begin_listing(self._bulk.id, self._workspace.lease)
         if bulk is None:
             return False
         self._listing = self._submit(list_files, self._beside, bulk, self._news.set, self._stop.is_set)
@@ -163,7 +163,7 @@ class _Turn:
         This wait does not count towards the time limit of a job.
         """
         self._finish_writing()
-        error = self._context.guarded(lambda: self._context.report(LISTING, 0, 1))
+        error = self._workspace.guarded(lambda: self._workspace.report(LISTING, 0, 1))
         assert error is None, error
         self._news.wait(TELL_EVERY_S or 0.1)
         self._news.clear()
@@ -172,8 +172,8 @@ class _Turn:
 
     def _read(self) -> _Reading:
         """Let a thread take an image and read it."""
-        context, bulk = self._context, self._bulk
-        next_item = self._submit(self._bulks.take, bulk.id, context.lease, context.settings.max_attempts)
+        workspace, bulk = self._workspace, self._bulk
+        next_item = self._submit(self._bulks.take, bulk.id, workspace.lease, workspace.settings.max_attempts)
 
         def read() -> tuple[Ready | Outcome, float] | None:
             item, began = next_item.result(), time.perf_counter()
@@ -198,9 +198,9 @@ class _Turn:
 
         If the whole turn must stop, the image is released for another turn.
         """
-        self._context.times.begin(STARTING)
+        self._workspace.times.begin(STARTING)
         write = self._ended_or_released(item, lambda: self._computed(item, reading))
-        self._context.times.begin(BETWEEN)
+        self._workspace.times.begin(BETWEEN)
         if write is not None:
             self._finish_writing()
             self._writing = item, self._submit(write)
@@ -210,7 +210,7 @@ class _Turn:
         read = _awaited(reading.image, lambda: self._report("reading", 0, 1))
         assert read is not None
         ready, read_s = read
-        if item.attempts > 1 or self._context.settings.max_attempts == 1:
+        if item.attempts > 1 or self._workspace.settings.max_attempts == 1:
             self._finish_writing()
         elif time.monotonic() < self._ends_at:
             self._ahead = self._read()
@@ -221,20 +221,20 @@ class _Turn:
             return partial(self._record, item, lambda: existing, read_s)
         self._product_ids.add(ready.destination.identity)
         began, reports_s = time.perf_counter(), self._reports_s
-        made = compute_one(self._computing, ready)
+        result = compute_one(self._computing, ready)
         # without the time that was spent on reports of progress
         kernel_s = time.perf_counter() - began - (self._reports_s - reports_s)
-        return partial(self._record, item, partial(self._written, ready, made, kernel_s), read_s + kernel_s)
+        return partial(self._record, item, partial(self._written, ready, result, kernel_s), read_s + kernel_s)
 
     def _made_meanwhile(self, destination: Destination) -> Outcome | None:
         """The product of an image whose content this turn deconvolved after the image was read; None for another image."""
         if destination.identity not in self._product_ids:
             return None
         self._finish_writing()
-        return done_before(self._context, destination)
+        return done_before(self._workspace, destination)
 
-    def _written(self, ready: Ready, made: Made, kernel_s: float) -> Outcome:
-        outcome = write_one(self._beside, ready, made)
+    def _written(self, ready: Ready, result: Result, kernel_s: float) -> Outcome:
+        outcome = write_one(self._beside, ready, result)
         kernel = {"kernel_seconds": round(kernel_s, 3), "start_s": ready.start_s}
         return dataclasses.replace(outcome, statistics=outcome.statistics | kernel)
 
@@ -259,7 +259,7 @@ class _Turn:
         """
         answers: list[Answer] = []
         try:
-            error = self._context.guarded(lambda: answers.append(work()))
+            error = self._workspace.guarded(lambda: answers.append(work()))
         except BaseException:
             self._bulks.release(item)
             raise
@@ -276,10 +276,10 @@ class _Turn:
 
     def _report(self, stage: str, step: int, _steps: int) -> None:
         """Count the stage of an image, and report the images that are done, at most once a second. Raises if the turn must stop."""
-        with self._context.times.step(stage, step):
+        with self._workspace.times.step(stage, step):
             began = time.perf_counter()
             if began - self._reported_at >= TELL_EVERY_S:
-                self._context.report("images", self._bulk.done + self._bulk.failed, self._bulk.total)
+                self._workspace.report("images", self._bulk.done + self._bulk.failed, self._bulk.total)
                 self._reported_at = time.perf_counter()
                 self._reports_s += self._reported_at - began
 

@@ -48,7 +48,7 @@ Task = Callable[[Any, Mapping[str, Any]], str]
 Assistant = Callable[[Any, Mapping[str, Any]], None]
 
 
-class Result(StrEnum):
+class ResultType(StrEnum):
     """The type of a job's result. The value is the beginning of the address of such a result."""
 
     PRODUCT = "/v1/products"
@@ -87,7 +87,7 @@ class Kind:
 
     name: str
     task: str
-    result: Result
+    result: ResultType
     parameters: type[Parameters] | None = None
     resolved: type[Parameters] | None = None
     identity: Callable[[Any], str] | None = None
@@ -119,7 +119,7 @@ _ROWS = (
     Kind(
         "deconvolve",
         task="workers.tasks.deconvolve:deconvolve",
-        result=Result.PRODUCT,
+        result=ResultType.PRODUCT,
         parameters=Deconvolve,
         resolved=ResolvedDeconvolve,
         identity=product_identity,
@@ -131,7 +131,7 @@ _ROWS = (
     Kind(
         "psf-build",
         task="workers.tasks.psf_build:psf_build",
-        result=Result.PSF,
+        result=ResultType.PSF,
         parameters=PsfBuild,
         resolved=PsfBuild,
         identity=psf_identity,
@@ -143,7 +143,7 @@ _ROWS = (
     Kind(
         "psf-fit",
         task="workers.tasks.psf_fit:psf_fit",
-        result=Result.PSF,
+        result=ResultType.PSF,
         parameters=PsfFit,
         resolved=ResolvedPsfFit,
         identity=psf_fit_identity,
@@ -153,7 +153,7 @@ _ROWS = (
     Kind(
         "psf-interpolate",
         task="workers.tasks.interpolation:psf_interpolate",
-        result=Result.PSF,
+        result=ResultType.PSF,
         parameters=PsfInterpolate,
         resolved=PsfInterpolate,
         identity=interpolated_psf_identity,
@@ -162,8 +162,8 @@ _ROWS = (
     ),
     Kind(
         "psf-tables",
-        task="workers.tasks.psf_build:psf_tables",
-        result=Result.PSF,
+        task="workers.tasks.psf_tables:psf_tables",
+        result=ResultType.PSF,
         parameters=PsfTables,
         resolved=PsfTables,
         identity=request_identity("psf-tables"),
@@ -173,7 +173,7 @@ _ROWS = (
     Kind(
         "cross-validate",
         task="workers.tasks.crossval:cross_validate",
-        result=Result.REPORT,
+        result=ResultType.REPORT,
         parameters=CrossValidate,
         resolved=ResolvedCrossValidate,
         identity=psf_fit_identity,
@@ -185,7 +185,7 @@ _ROWS = (
     Kind(
         "report",
         task="workers.tasks.report:report",
-        result=Result.REPORT,
+        result=ResultType.REPORT,
         parameters=Report,
         resolved=ResolvedReport,
         identity=report_identity,
@@ -195,7 +195,7 @@ _ROWS = (
     Kind(
         "gap-diagnose",
         task="workers.tasks.gap:gap_diagnose",
-        result=Result.REPORT,
+        result=ResultType.REPORT,
         parameters=GapDiagnose,
         resolved=ResolvedGapDiagnose,
         identity=gap_identity,
@@ -205,7 +205,7 @@ _ROWS = (
     Kind(
         "rerun",
         task="workers.tasks.rerun:rerun",
-        result=Result.REPORT,
+        result=ResultType.REPORT,
         parameters=Rerun,
         resolved=ResolvedRerun,
         resolver="workers.intake.requests:resolve_rerun",
@@ -214,7 +214,7 @@ _ROWS = (
     Kind(
         "bulk",
         task="workers.bulk.task:bulk_turn",
-        result=Result.BULK,
+        result=ResultType.BULK,
         queue=Queue.BULK,
         needs_room=False,
     ),

@@ -21,16 +21,16 @@ from workers.catalogue.tables import (
 )
 from workers.contract.identities import request_identity
 from workers.contract.jobs import Phase, Queue
-from workers.contract.kinds import KINDS, Result
+from workers.contract.kinds import KINDS, ResultType
 from workers.contract.requests import PsfTables
 from workers.files.collection import Fault, intact
 from workers.files.store import Store
 from workers.lineage import made_by
 
-TABLES: dict[Result, type[Any]] = {
-    Result.PRODUCT: ProductRow,
-    Result.PSF: PsfRow,
-    Result.REPORT: ReportRow,
+TABLES: dict[ResultType, type[Any]] = {
+    ResultType.PRODUCT: ProductRow,
+    ResultType.PSF: PsfRow,
+    ResultType.REPORT: ReportRow,
 }
 
 
@@ -58,7 +58,7 @@ def without_results(jobs: Sequence[JobRow], catalogue: Catalogue) -> frozenset[s
     return frozenset(gone)
 
 
-def there(result: Result, identity: str, owner: str, catalogue: Catalogue, store: Store) -> bool:
+def there(result: ResultType, identity: str, owner: str, catalogue: Catalogue, store: Store) -> bool:
     """Whether the catalogue has the result with this identity, with all its files. Raises ``StoreAway``."""
     table = TABLES.get(result)
     row = None if table is None else catalogue.get(table, identity, owner)

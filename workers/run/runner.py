@@ -30,7 +30,8 @@ from workers.run.attempt import Assistance, Attempt, Cancelled, TookTooLong
 from workers.run.child import MARGIN, Child, Stopping, allowed_mib, is_out_of_memory
 from workers.settings import Settings
 from workers.stage_timer import StageTimer
-from workers.tasks.context import Context, TurnOver
+from workers.tasks.catalogue_workspace import CatalogueWorkspace
+from workers.tasks.workspace import TurnOver
 
 log = logging.getLogger(__name__)
 FAILED = "job %s: %s (%s)"  # log line about a failed job: its id, and the message and the code of its error
@@ -133,11 +134,11 @@ class Runner:
         if assistant is None:
             return
         assistance = Assistance(self._catalogue, job_id, self._stopping)
-        context = self._context(job, assistance)
+        workspace = self._workspace(job, assistance)
         with logs.bound(job=job.id, owner=job.owner):
             try:
                 with self._limited(job):
-                    assistant(context, job.parameters)
+                    assistant(workspace, job.parameters)
             except Cancelled:
                 log.info("job %s: this worker stops assisting", job_id)
             except Exception:
@@ -145,9 +146,9 @@ class Runner:
                 log.exception("job %s: assisting failed", job_id)
             self._keep_times(job, assistance.times)
 
-    def _context(self, job: JobRow, work: Attempt | Assistance, **functions: Any) -> Context:
-        """The context of a task or an assistant. functions: what only a task may use."""
-        return Context(
+    def _workspace(self, job: JobRow, work: Attempt | Assistance, **functions: Any) -> CatalogueWorkspace:
+        """The workspace of a task or an assistant. functions: what only a task may use."""
+        return CatalogueWorkspace(
             catalogue=self._catalogue,
             store=self._store,
             settings=self._settings,
@@ -159,7 +160,7 @@ class Runner:
         )
 
     def _attempt(self, job: JobRow, lease: Lease, attempt: Attempt) -> None:
-        context = self._context(
+        workspace = self._workspace(
             job,
             attempt,
             call_for_help=lambda workers: self._call_for_help(job.id, workers),
@@ -170,7 +171,7 @@ class Runner:
         try:
             self._check_room(job)
             with self._limited(job):
-                result_id = KINDS[job.kind].load_task()(context, job.parameters)
+                result_id = KINDS[job.kind].load_task()(workspace, job.parameters)
         except TurnOver:
             self._let_others_go_first(job, lease)
         except Cancelled:

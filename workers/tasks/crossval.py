@@ -7,7 +7,6 @@ folds that no other worker takes, so the job does not depend on help.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +14,7 @@ import numpy as np
 
 from psfcore.errors import module_of_extra
 from psfcore.psf import CURVE_RADII_PX
+from psfcore.scatter.inversion import solution_of
 from psfcore.scatter.reconstruction import Solution
 from psfcore.scatter.shapes import shape_named
 from psfcore.scatter.validation.cross_validation import (
@@ -28,116 +28,35 @@ from psfcore.scatter.validation.cross_validation import (
     exact_fit,
     shared_fits,
 )
-from psfcore.transit.transit import Transit
 from workers.contract.identities import psf_fit_identity
+from workers.contract.kinds import ResultType
 from workers.contract.requests import ResolvedCrossValidate
-from workers.tasks.results import Finished, keep_report, provenance_of, report_made
-from workers.tasks.transits import load_transit, solved
+from workers.tasks.results import provenance_of, report_result
+from workers.tasks.transits import load_transit
+from workers.tasks.workspace import Json, Progress, Workspace
 
 if TYPE_CHECKING:
-    from workers.catalogue.jobs import Part
-    from workers.tasks.context import Context
+    from workers.tasks.catalogue_workspace import CatalogueWorkspace
 
+Samples = tuple[FoldSample, ...]
 _PLOT = "psfcore.scatter.plots"
-WAIT_S = 0.5
-MOST_HELPERS = 16
 
 
-def cross_validate(context: Context, parameters: Mapping[str, Any]) -> str:
+def cross_validate(workspace: Workspace, parameters: Mapping[str, Any]) -> str:
     """Cross-validate the fit of a transit; returns the report's id."""
     request = ResolvedCrossValidate.model_validate(parameters)
     identity = psf_fit_identity(request)
-    if report_made(context, identity):
+    if workspace.has(ResultType.REPORT, identity):
         return identity
-    transit = load_transit(context, request)[0]
-    wanted = bootstrap_samples(len(transit.frames), runs=request.runs, seed=request.seed)
-    solution = _solution(context, request, transit)
+    solution, samples = _solution(workspace, request)
     if request.scheme == "shared":
-        fits = shared_fits(solution, wanted, progress=context.report)
+        fits = shared_fits(solution, samples, progress=workspace.report)
     else:
-        fits = _exact(context, identity, solution, wanted)
-    report = report_of(request, transit, fits, job_id=context.job_id)
-    keep_report(context, identity, "cross-validation", report, transit_id=request.transit_id)
-    return identity
-
-
-def assist_cross_validation(context: Context, parameters: Mapping[str, Any]) -> None:
-    """Compute folds of a job that another worker runs, until no fold is left."""
-    request = ResolvedCrossValidate.model_validate(parameters)
-    identity = psf_fit_identity(request)
-    part = context.catalogue.parts.take(context.owner, identity, context.settings.lease_s)
-    if part is None:
-        return
-    context.catalogue.parts.release(part)  # reading and fitting a transit takes longer than a lease
-    transit = load_transit(context, request)[0]
-    wanted = bootstrap_samples(len(transit.frames), runs=request.runs, seed=request.seed)
-    solution = _solution(context, request, transit)
-    while (
-        part := context.catalogue.parts.take(context.owner, identity, context.settings.lease_s)
-    ) is not None:
-        _one(context, solution, wanted, part, done=0)
-
-
-def _solution(context: Context, request: ResolvedCrossValidate, transit: Transit) -> Solution:
-    """The fit of all images; every fold starts from this fit.
-
-    Helping workers read the solution that the worker of the job has stored.
-    """
-    return solved(context, request, transit, shape_named(request.shape), progress=context.report)
-
-
-def _exact(
-    context: Context, identity: str, solution: Solution, wanted: tuple[FoldSample, ...]
-) -> tuple[FoldFit, ...]:
-    """Fit every fold with its own reconstructions, here or on the workers that help."""
-    catalogue, owner = context.catalogue, context.owner
-    catalogue.parts.open(owner, identity, len(wanted))
-    context.call_for_help(min(MOST_HELPERS, len(wanted) - 1))
-    while True:
-        done = catalogue.parts.results(owner, identity)
-        context.report("folds", len(done), len(wanted))
-        if len(done) == len(wanted):
-            return tuple(FoldFit.from_json(result) for result in done)
-        part = catalogue.parts.take(owner, identity, context.settings.lease_s)
-        if part is None:
-            time.sleep(WAIT_S)  # other workers compute the remaining folds
-            continue
-        _one(context, solution, wanted, part, done=len(done))
-
-
-def _one(
-    context: Context, solution: Solution, wanted: tuple[FoldSample, ...], part: Part, *, done: int
-) -> None:
-    """Compute one fold. After an exception the fold is released for another worker."""
-    try:
-        fit = exact_fit(solution, wanted[part.number], progress=_heartbeat(context, part, done, len(wanted)))
-    except BaseException:
-        context.catalogue.parts.release(part)
-        raise
-    context.catalogue.parts.finish(part, fit.to_json())
-
-
-def _heartbeat(context: Context, part: Part, done: int, folds: int) -> Callable[[str, int, int], None]:
-    """A progress function for a fold. The function renews the lease of the part, and raises an exception if the job
-    must stop."""
-    last = time.monotonic()
-
-    def report(_stage: str, _step: int, _steps: int) -> None:
-        nonlocal last
-        context.report("folds", done, folds)
-        if time.monotonic() - last > context.settings.heartbeat_s:
-            last = time.monotonic()
-            context.catalogue.parts.heartbeat(part)
-
-    return report
-
-
-def report_of(
-    request: ResolvedCrossValidate, transit: Transit, fits: tuple[FoldFit, ...], *, job_id: str
-) -> Finished:
-    """The report on the fits of all folds."""
+        results = workspace.parts(identity, len(samples), _fold(solution, samples))
+        fits = tuple(FoldFit.from_json(result) for result in results)
+    transit = solution.transit
     found = bands(fits, np.array(CURVE_RADII_PX[: len(fits[0].curve_pct)]))
-    said = {
+    content = {
         "schema": "cross-validation/2",
         "sentence": sentence(found, len(fits)),
         "scheme": request.scheme,
@@ -146,14 +65,53 @@ def report_of(
         "files": {str(n): frame.file for n, frame in enumerate(transit.frames)},
         "folds": [fit.to_json() for fit in fits],
         "inputs_sha256": transit.sha256,
-        "provenance": provenance_of(job_id, request),
+        "provenance": provenance_of(workspace.job_id, request),
     }
+    details = {"sentence": content["sentence"], "held_out": found.held_out, "folds": len(fits)}
     pointings = [frame.pointing for frame in transit.frames]
-    return Finished(
-        said,
-        {"sentence": said["sentence"], "held_out": found.held_out, "folds": len(fits)},
-        draw=lambda path: module_of_extra(_PLOT).cross_validation_png(found, fits, pointings, path),
+    workspace.add(
+        report_result(
+            identity,
+            "cross-validation",
+            content,
+            details,
+            draw=lambda path: module_of_extra(_PLOT).cross_validation_png(found, fits, pointings, path),
+            transit_id=request.transit_id,
+        )
     )
+    return identity
+
+
+def assist_cross_validation(workspace: CatalogueWorkspace, parameters: Mapping[str, Any]) -> None:
+    """Compute folds of a job that another worker runs, until no fold is left."""
+    request = ResolvedCrossValidate.model_validate(parameters)
+    identity = psf_fit_identity(request)
+    if workspace.has_parts_left(identity):  # reading and fitting a transit takes longer than a lease
+        solution, samples = _solution(workspace, request)
+        workspace.assist(identity, len(samples), _fold(solution, samples))
+
+
+def _solution(workspace: Workspace, request: ResolvedCrossValidate) -> tuple[Solution, Samples]:
+    """The fit of all images, with which every fold starts, and the samples of the folds.
+
+    Helping workers read the solution that the worker of the job has stored.
+    """
+    transit, _ = load_transit(workspace, request)
+    samples = bootstrap_samples(len(transit.frames), runs=request.runs, seed=request.seed)
+    given = workspace.inverter(request)
+    solution = solution_of(
+        transit,
+        shape_named(request.shape),
+        given,
+        threads=workspace.threads,
+        progress=workspace.report,
+    )
+    return solution, samples
+
+
+def _fold(solution: Solution, samples: Samples) -> Callable[[int, Progress], Json]:
+    """The function that fits a fold with its own reconstructions."""
+    return lambda number, progress: exact_fit(solution, samples[number], progress=progress).to_json()
 
 
 def sentence(found: Bands, folds: int) -> str:

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from psfcore.errors import DataError, module_of_extra
 from psfcore.gap.corrected_psf import corrected_psf
@@ -20,65 +19,27 @@ from psfcore.gap.library.registry import Added, added_effects, library_with
 from psfcore.gap.report.report import gap_report
 from psfcore.psf import Psf
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW
-from psfcore.transit.transit import Transit
 from workers.contract.identities import corrected_psf_identity, diffraction_identity, gap_identity
+from workers.contract.kinds import ResultType
 from workers.contract.requests import ResolvedGapDiagnose
-from workers.tasks.results import (
-    Finished,
-    Means,
-    given_psf,
-    keep_psf,
-    keep_report,
-    provenance_of,
-    report_made,
-)
-from workers.tasks.transits import load_transit, means_of
-
-if TYPE_CHECKING:
-    from workers.tasks.context import Context
+from workers.tasks.results import provenance_of, psf_result, report_result
+from workers.tasks.transits import load_transit
+from workers.tasks.workspace import Workspace
 
 KIND = "gap"
+_SHOWN = ("sentence", "lines", "verdict", "answer", "gap", "cautions")
 
 
-def gap_diagnose(context: Context, parameters: Mapping[str, Any]) -> str:
-    """Diagnose the gap of a transit; returns the report's id."""
+def gap_diagnose(workspace: Workspace, parameters: Mapping[str, Any]) -> str:
+    """Diagnose the gap of a transit; returns the report's id. If the request asks for it and effects were found, the corrected PSF
+    is another result."""
     request = ResolvedGapDiagnose.model_validate(parameters)
     identity = gap_identity(request)
-    if report_made(context, identity):
+    if workspace.has(ResultType.REPORT, identity):
         return identity
-    added = _added(context, request)
-    parent = given_psf(context, request.psf_id)
-    transit, _ = load_transit(context, request)
-    report, corrected = diagnosis_of(request, transit, parent, added, means_of(context, request))
-    if corrected is not None:
-        parents = corrected.provenance["parents"]
-        keep_psf(
-            context,
-            corrected,
-            corrected.provenance["psf_id"],
-            origin="fitted",
-            draw=partial(module_of_extra("psfcore.drawing.plots").psf_png, corrected),
-            details={
-                "transit_id": parents["transit"],
-                "parents": parents,
-                "diffraction_psf_id": corrected.provenance["diffraction_psf_id"],
-            },
-        )
-    keep_report(context, identity, KIND, report, transit_id=request.transit_id)
-    return identity
-
-
-def diagnosis_of(
-    request: ResolvedGapDiagnose,
-    transit: Transit,
-    parent: Psf | None,
-    added: tuple[Added, ...],
-    means: Means,
-) -> tuple[Finished, Psf | None]:
-    """Diagnose a transit as a request says: the report, and the corrected PSF if it was asked for and effects were found.
-
-    parent: the PSF with which the fit starts. added: effects that are added to the library.
-    """
+    added = _added(workspace, request)
+    parent = None if request.psf_id is None else workspace.psf(request.psf_id)
+    transit, _ = load_transit(workspace, request)
     shape, start = (SOFTENED_POWER_LAW, None) if parent is None else start_of(parent)
     found = diagnose(
         transit,
@@ -87,12 +48,12 @@ def diagnosis_of(
         start=start,
         seed=request.seed,
         coverage=request.coverage,
-        threads=means.threads,
-        progress=means.progress,
-        solution=means.solution,
+        threads=workspace.threads,
+        progress=workspace.report,
+        solution=workspace.inverter(request),
     )
-    provenance = _provenance(request, parent, added, means.job_id)
-    corrected = None
+    provenance = _provenance(request, parent, added, workspace.job_id)
+    corrected_id = None
     if request.correct and found.corrected is not None:
         try:
             corrected = _corrected(found, provenance)
@@ -100,33 +61,52 @@ def diagnosis_of(
             # An added effect may be defined for images but not for a point source. The diagnosis itself remains valid.
             caution = f"The corrected PSF could not be made: {error.message}"
             found = replace(found, cautions=(*found.cautions, caution))
-    corrected_id = None if corrected is None else corrected.provenance["psf_id"]
-    said = gap_report(found) | {"provenance": provenance | {"corrected_psf_id": corrected_id}}
-    report = Finished(
-        said,
-        {
-            **{name: said[name] for name in ("sentence", "lines", "verdict", "answer", "gap", "cautions")},
-            "strongest_axis": said["where"][0]["axis"],
-            "psf_id": request.psf_id,
-            "corrected_psf_id": corrected_id,
-        },
-        draw=lambda path: path.write_bytes(module_of_extra("psfcore.gap.report.plot").gap_png(found, said)),
-        page=lambda: module_of_extra("psfcore.gap.report.page").gap_page(found, said),
+        else:
+            corrected_id = corrected.provenance["psf_id"]
+            parents = corrected.provenance["parents"]
+            details = {
+                "transit_id": parents["transit"],
+                "parents": parents,
+                "diffraction_psf_id": corrected.provenance["diffraction_psf_id"],
+            }
+            workspace.add(
+                psf_result(
+                    corrected, corrected_id, origin="fitted", details=details, threads=workspace.threads
+                )
+            )
+    content = gap_report(found) | {"provenance": provenance | {"corrected_psf_id": corrected_id}}
+    workspace.add(
+        report_result(
+            identity,
+            KIND,
+            content,
+            {
+                **{name: content[name] for name in _SHOWN},
+                "strongest_axis": content["where"][0]["axis"],
+                "psf_id": request.psf_id,
+                "corrected_psf_id": corrected_id,
+            },
+            draw=lambda path: path.write_bytes(
+                module_of_extra("psfcore.gap.report.plot").gap_png(found, content)
+            ),
+            page=lambda: module_of_extra("psfcore.gap.report.page").gap_page(found, content),
+            transit_id=request.transit_id,
+        )
     )
-    return report, corrected
+    return identity
 
 
-def _added(context: Context, request: ResolvedGapDiagnose) -> tuple[Added, ...]:
+def _added(workspace: Workspace, request: ResolvedGapDiagnose) -> tuple[Added, ...]:
     """The effects that the operator added. A worker runs only the code that its own settings name, never code from a
     job.
 
     Raises DataError "effects-changed" if the effects have changed since the job was submitted.
     """
-    if request.added_effects != context.settings.added_effects:
+    if request.added_effects != workspace.settings.added_effects:
         raise DataError(
             "effects-changed",
             f"expected the added effects of the job ({', '.join(request.added_effects) or 'none'}); this worker has "
-            f"{', '.join(context.settings.added_effects) or 'none'}: submit the job again",
+            f"{', '.join(workspace.settings.added_effects) or 'none'}: submit the job again",
         )
     added = added_effects(request.added_effects)
     here = tuple(one.sha256 for one in added)

@@ -5,49 +5,45 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from datetime import datetime
-from functools import partial
 from typing import Any
 
 import numpy as np
 
-from psfcore.fits.psfs import read_psf
 from psfcore.psf import CURVE_RADII_PX, Psf, cumulative_curve
 from psfcore.scatter.interpolation import Epoch, curve_sigma, interpolated_psf, parameters_of
 from workers.catalogue.tables import PsfRow
 from workers.contract.identities import interpolated_psf_identity
+from workers.contract.kinds import ResultType
 from workers.contract.requests import PsfInterpolate
 from workers.intake.compatibility import of_upload
-from workers.tasks.context import Context
-from workers.tasks.results import keep_psf, named_psf, provenance_of
+from workers.tasks.catalogue_workspace import CatalogueWorkspace
+from workers.tasks.results import provenance_of, psf_result
 from workers.versions import INTERPOLATED, interpolated_name
 
 STAGE = "interpolating the PSF"
 
 
-def psf_interpolate(context: Context, parameters: Mapping[str, Any]) -> str:
+def psf_interpolate(workspace: CatalogueWorkspace, parameters: Mapping[str, Any]) -> str:
     """Interpolate between two PSFs of the catalogue, and add the new PSF to it; returns the PSF's id."""
-    return interpolated_row(context, PsfInterpolate.model_validate(parameters)).id
+    return interpolate_psf(workspace, PsfInterpolate.model_validate(parameters))
 
 
-def interpolated_row(context: Context, request: PsfInterpolate) -> PsfRow:
-    """The row of the interpolated PSF. If the catalogue does not contain this PSF, it is made and added.
+def interpolate_psf(workspace: CatalogueWorkspace, request: PsfInterpolate) -> str:
+    """Interpolate between two PSFs, unless an earlier job did; returns the id of the PSF.
 
     Raises DataError "no-such-psf", and the errors of ``psfcore.scatter.interpolation.interpolated_psf``.
     """
     identity = interpolated_psf_identity(request)
-    made = context.made(PsfRow, identity)
-    if made is not None:
-        return made
-    from psfcore.drawing.plots import psf_png  # matplotlib is loaded only if a picture is drawn
-
-    context.report(STAGE, 0, 2)
+    if workspace.has(ResultType.PSF, identity):
+        return identity
+    workspace.report(STAGE, 0, 2)
     ends = {
-        "before": _epoch(context, request.before_psf_id, request.before_time),
-        "after": _epoch(context, request.after_psf_id, request.after_time),
+        "before": _epoch(workspace, request.before_psf_id, request.before_time),
+        "after": _epoch(workspace, request.after_psf_id, request.after_time),
     }
     name, version = interpolated_name(ends["before"].psf.instrument, identity)
     # The id of the job is in the details of the row, not in the file, so that the file can be made again bit for bit.
-    provenance = {"psf_id": identity, **provenance_of(context.job_id, request)}
+    provenance = {"psf_id": identity, **provenance_of(workspace.job_id, request)}
     del provenance["job_id"]
     psf = interpolated_psf(
         ends["before"],
@@ -56,31 +52,30 @@ def interpolated_row(context: Context, request: PsfInterpolate) -> PsfRow:
         name=name,
         version=version,
         provenance=provenance,
-        threads=context.settings.threads,
+        threads=workspace.threads,
     )
-    context.report(STAGE, 1, 2)
+    workspace.report(STAGE, 1, 2)
     parents = psf.provenance["interpolated_between"]
-    return keep_psf(
-        context,
-        psf,
-        identity,
-        origin=INTERPOLATED,
-        draw=partial(psf_png, psf),
-        # The files of the ends do not name the variant of the channel; their rows do.
-        channel=named_psf(context, request.before_psf_id).channel,
-        details={
-            "parents": {name: end["psf_id"] for name, end in zip(("before", "after"), parents, strict=True)},
-            "weights": {end["psf_id"]: end["weight"] for end in parents},
-            "job_id": context.job_id,
-            "fit": _fit_of(psf, context.settings.threads),
-        },
+    details = {
+        "parents": {name: end["psf_id"] for name, end in zip(("before", "after"), parents, strict=True)},
+        "weights": {end["psf_id"]: end["weight"] for end in parents},
+        "job_id": workspace.job_id,
+        "fit": _fit_of(psf, workspace.threads),
+    }
+    # The files of the ends do not name the variant of the channel; their rows do.
+    channel = workspace.row(PsfRow, request.before_psf_id).channel
+    workspace.add(
+        psf_result(
+            psf, identity, origin=INTERPOLATED, channel=channel, details=details, threads=workspace.threads
+        )
     )
+    return identity
 
 
-def _epoch(context: Context, psf_id: str, time: str) -> Epoch:
+def _epoch(workspace: CatalogueWorkspace, psf_id: str, time: str) -> Epoch:
     """A PSF of the catalogue, and the time at which it holds."""
-    row = named_psf(context, psf_id)
-    psf = read_psf(context.store.verified(row.file_sha256), context.settings.psf_limits)
+    row = workspace.row(PsfRow, psf_id)
+    psf = workspace.psf_of(row)
     # The request of an upload or of a certification may give an instrument and a channel that the file does not contain.
     instrument, angstrom = of_upload(row, psf.instrument, psf.wavelength_angstrom)
     psf = replace(

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -16,62 +17,57 @@ from numpy.typing import NDArray
 from psfcore.arrays import Comparison, compare
 from psfcore.errors import DataError
 from psfcore.fits.images import read_plane, read_planes
-from psfcore.fits.psfs import read_psf
-from workers.catalogue.catalogue import Catalogue, Row
-from workers.catalogue.tables import ProductRow, PsfRow, ReportRow
+from workers.catalogue.catalogue import Row
+from workers.catalogue.tables import ProductRow, PsfRow
 from workers.contract.identities import rerun_identity
-from workers.contract.kinds import KINDS
+from workers.contract.kinds import KINDS, ResultType
 from workers.contract.requests import ResolvedRerun
 from workers.lineage import Made, lineage
-from workers.rows import row_of
-from workers.tasks.context import Context
-from workers.tasks.results import add_report, named_psf, write_json
+from workers.tasks.catalogue_workspace import CatalogueWorkspace, ResultRow
+from workers.tasks.results import report_result
+from workers.tasks.workspace import Result
 
 KIND = "rerun"
 SCHEMA = 1
 Thing = ProductRow | PsfRow
 
 
-class _RerunCatalogue(Catalogue):
-    """The catalogue without the rows in `hidden`, so that a task makes them again.
+@dataclass(frozen=True)
+class RerunWorkspace(CatalogueWorkspace):
+    """A workspace in which the results in `hidden` do not exist, so that a task makes them again. The rows of new results are in
+    `rows` and not in the catalogue."""
 
-    Added rows go into the list ``made``, not into the database.
-    """
+    hidden: frozenset[str] = frozenset()
+    rows: list[ResultRow] = field(default_factory=list)
 
-    def __init__(self, real: Catalogue, hidden: frozenset[str]) -> None:
-        vars(self).update(vars(real))  # the same database connection and tables
-        self._hidden = hidden
-        self.made: list[object] = []
+    def row(self, table: type[Row], identity: str) -> Row:
+        for row in self.rows:
+            if isinstance(row, table) and row.id == identity:
+                return row
+        return super().row(table, identity)
 
-    def get(self, table: type[Row], identity: str, owner: str) -> Row | None:
-        """The row of this identity; None if it does not exist or is hidden."""
-        return None if identity in self._hidden else super().get(table, identity, owner)
+    def has(self, result: ResultType, identity: str) -> bool:
+        return identity not in self.hidden and super().has(result, identity)
 
-    def add(self, row: Row, quota_mib: int | None = None) -> tuple[Row, bool]:
-        """Append the row to the list ``made``. This method writes nothing to the database and does not check the quota."""
-        self.made.append(row)
-        return row, True
+    def keep(self, result: Result) -> ResultRow:
+        self.rows.append(self.stored(result))
+        return self.rows[-1]
 
 
-def rerun(context: Context, parameters: Mapping[str, Any]) -> str:
+def rerun(workspace: CatalogueWorkspace, parameters: Mapping[str, Any]) -> str:
     """Make a product or a PSF again, and compare it with the first one; returns the report's id."""
     request = ResolvedRerun.model_validate(parameters)
-    identity = rerun_identity(request, context.job_id)
-    if context.catalogue.get(ReportRow, identity, context.owner) is not None:
+    identity = rerun_identity(request, workspace.job_id)
+    if workspace.has(ResultType.REPORT, identity):
         return identity
-    first = _first(context, request)
-    again = _made_again(context, request, first)
-    _save(context, identity, request, first, again)
+    table: Any = PsfRow if request.of == "psf" else ProductRow
+    first: Thing = workspace.row(table, request.id)
+    again = _made_again(workspace, request, first)
+    _save(workspace, identity, request, first, again)
     return identity
 
 
-def _first(context: Context, request: ResolvedRerun) -> Thing:
-    if request.of == "psf":
-        return named_psf(context, request.id)
-    return row_of(context.catalogue, ProductRow, request.id, context.owner)
-
-
-def _made_again(context: Context, request: ResolvedRerun, first: Thing) -> Thing:
+def _made_again(workspace: CatalogueWorkspace, request: ResolvedRerun, first: Thing) -> Thing:
     """The product or PSF as this version makes it. Its file is in the store; its row is not in the catalogue."""
     named = first.details.get("parents") or {}
     hidden = {first.id, *([named["report"]] if "report" in named else [])}
@@ -82,12 +78,12 @@ def _made_again(context: Context, request: ResolvedRerun, first: Thing) -> Thing
         # product already.
         assert kind.resolved is not None and kind.identity is not None
         hidden.add(kind.identity(kind.resolved.model_validate(parameters)))
-    rerun_catalogue = _RerunCatalogue(context.catalogue, frozenset(hidden))
     if request.kind == "psf-build":
-        parameters |= {"instrument": None, "instrument_file": _instrument_text(context, first)}
-    kind.load_task()(dataclasses.replace(context, catalogue=rerun_catalogue, anew=True), parameters)
+        parameters |= {"instrument": None, "instrument_file": _instrument_text(workspace, first)}
+    again = RerunWorkspace(**vars(workspace) | {"anew": True}, hidden=frozenset(hidden))
+    kind.load_task()(again, parameters)
     # The last row is the requested product or PSF. The rows before it had been deleted and were needed again.
-    made = [row for row in rerun_catalogue.made if isinstance(row, type(first))]
+    made = [row for row in again.rows if isinstance(row, type(first))]
     if not made:
         raise DataError(
             "not-made-again",
@@ -99,25 +95,27 @@ def _made_again(context: Context, request: ResolvedRerun, first: Thing) -> Thing
     return found
 
 
-def _instrument_text(context: Context, first: Thing) -> str:
+def _instrument_text(workspace: CatalogueWorkspace, first: Thing) -> str:
     """The text of the instrument file that the first run used, because shipped files can change with the software."""
-    psf = read_psf(context.store.verified(first.file_sha256), context.settings.psf_limits)
-    text: str = psf.provenance["instrument_toml"]
+    assert isinstance(first, PsfRow)
+    text: str = workspace.psf_of(first).provenance["instrument_toml"]
     return text
 
 
-def _arrays(context: Context, row: Thing) -> dict[str, NDArray[Any]]:
+def _arrays(workspace: CatalogueWorkspace, row: Thing) -> dict[str, NDArray[Any]]:
     """The image arrays of a product or PSF file, by name."""
-    path = context.store.verified(row.file_sha256)
-    if isinstance(row, ProductRow):
-        return {"IMAGE": read_plane(path, context.limits), **read_planes(path)}
-    psf = read_psf(path, context.settings.psf_limits)
-    return {"PSF": psf.kernel, **psf.components}
+    if isinstance(row, PsfRow):
+        psf = workspace.psf_of(row)
+        return {"PSF": psf.kernel, **psf.components}
+    path = workspace.store.verified(row.file_sha256)
+    return {"IMAGE": read_plane(path, workspace.limits), **read_planes(path)}
 
 
-def _save(context: Context, identity: str, request: ResolvedRerun, first: Thing, again: Thing) -> None:
-    context.report("comparing", 0, 1)
-    arrays, others = _arrays(context, first), _arrays(context, again)
+def _save(
+    workspace: CatalogueWorkspace, identity: str, request: ResolvedRerun, first: Thing, again: Thing
+) -> None:
+    workspace.report("comparing", 0, 1)
+    arrays, others = _arrays(workspace, first), _arrays(workspace, again)
     nothing = np.zeros((0, 0))
     compared = {
         name: compare(arrays.get(name, nothing), others.get(name, nothing)) for name in {**arrays, **others}
@@ -131,22 +129,20 @@ def _save(context: Context, identity: str, request: ResolvedRerun, first: Thing,
         "same_file": first.file_sha256 == again.file_sha256,
         "largest_relative_difference": _largest(compared),
         "arrays": {name: dataclasses.asdict(one) for name, one in compared.items()},
-        "first": _made(context, first),
-        "again": _made(context, again) | {"id": again.id},
+        "first": _made(workspace, first),
+        "again": _made(workspace, again) | {"id": again.id},
         "parameters": request.parameters,
     }
-    with context.store.temporary() as text:
-        write_json(text, said)
-        named = ("of", "sentence", "same", "same_file", "largest_relative_difference")
-        details = {name: said[name] for name in named} | {"output_sha256": again.file_sha256}
-        context.report(
-            "comparing", 1, 1
-        )  # raises an exception if the job was cancelled, so that no report is kept
-        add_report(context, identity, KIND, text=text, details=details, about_id=request.id)
+    named = ("of", "sentence", "same", "same_file", "largest_relative_difference")
+    details = {name: said[name] for name in named} | {"output_sha256": again.file_sha256}
+    workspace.report(
+        "comparing", 1, 1
+    )  # raises an exception if the job was cancelled, so that no report is kept
+    workspace.add(report_result(identity, KIND, said, details, about_id=request.id))
 
 
-def _made(context: Context, row: Thing) -> dict[str, Any]:
-    made = lineage(context.catalogue, row).made
+def _made(workspace: CatalogueWorkspace, row: Thing) -> dict[str, Any]:
+    made = lineage(workspace.catalogue, row).made
     assert isinstance(made, Made)
     told: dict[str, Any] = json.loads(made.model_dump_json(exclude={"parameters"}))
     return told

@@ -1,89 +1,48 @@
-"""Results of tasks: PSFs and reports in the store and in the catalogue, and the provenance that they name."""
+"""Results of tasks: PSFs and reports, and the provenance that they name."""
 
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from psfcore.fits.psfs import read_psf, write_psf
+from psfcore.errors import module_of_extra
+from psfcore.fits.psfs import write_psf
 from psfcore.psf import Psf, light_beyond_pct
+from workers.contract.kinds import ResultType
 from workers.contract.requests import Parameters
-from workers.rows import row_of
 from workers.settings import library_versions, software_version
+from workers.tasks.workspace import Result
 from workers.versions import TOTAL, PsfStatus, channel_of, series_of
 
-if TYPE_CHECKING:
-    from psfcore.scatter.inversion import Inverter, Progress
-    from workers.catalogue.tables import PsfRow
-    from workers.files.store import Store
-    from workers.tasks.context import Context
-
-# PSFs -----------------------------------------------------------------------------------------------
+Write = Callable[[Path], object]
 
 
-def named_psf(context: Context, psf_id: str) -> PsfRow:
-    """The catalogue's row of a PSF. Raises DataError "no-such-psf"."""
-    from workers.catalogue.tables import PsfRow  # a command with --local needs no catalogue
-
-    return row_of(context.catalogue, PsfRow, psf_id, context.owner)
-
-
-def given_psf(context: Context, psf_id: str | None) -> Psf | None:
-    """The PSF that a request names, with its components and errors; None if the request names no PSF.
-
-    Raises DataError "no-such-psf".
-    """
-    if psf_id is None:
-        return None
-    return read_psf(
-        context.store.verified(named_psf(context, psf_id).file_sha256), context.settings.psf_limits
-    )
-
-
-def keep_psf(
-    context: Context,
+def psf_result(
     psf: Psf,
     identity: str,
     *,
     origin: str,
-    draw: Callable[[Path], object],
+    details: Mapping[str, Any],
+    threads: int,
+    draw: Write | None = None,
     kind: str = TOTAL,
     channel: str | None = None,
-    instrument_file: bytes | None = None,
-    details: Mapping[str, Any],
-) -> PsfRow:
-    """Write a draft PSF, its picture and its tables into the store, and add its row to the catalogue.
+    write: Write | None = None,
+    report: Mapping[str, Any] | None = None,
+) -> Result:
+    """A draft PSF.
 
-    draw: draws the picture into a PNG file. channel: None: as the PSF says. details: further entries for the details of the row.
+    write: writes its file; None: `write_psf`. draw: draws its picture into a PNG file; None: the PSF and its curves. channel: None: as the PSF says. details: further entries
+    of its details. report: of its fit, as JSON. threads: for its tables.
     """
-    from workers.catalogue.tables import PsfRow  # a command with --local needs no catalogue
-
-    store = context.store
-    with store.temporary() as file, store.temporary() as picture:
-        write_psf(file, psf, instrument_file=instrument_file)
-        draw(picture)
-        file_sha256, preview_sha256 = store.keep(file), store.keep(picture)
     channel = channel or channel_of(psf.instrument, psf.wavelength_angstrom)
-    row = PsfRow(
-        owner=context.owner,
-        id=identity,
-        created_at=time.time(),
-        name=psf.name,
-        version=psf.version,
-        instrument=psf.instrument,
-        channel=channel,
-        kind=kind,
-        series=series_of(psf.instrument, channel, kind),
-        status=PsfStatus.DRAFT,
-        origin=origin,
-        file_sha256=file_sha256,
-        bytes=store.path(file_sha256).stat().st_size,
-        preview_sha256=preview_sha256,
-        details={
+    return Result(
+        ResultType.PSF,
+        identity,
+        {
             "shape": list(psf.kernel.shape),
             "sum": float(psf.kernel.sum()),
             "plate_scale_arcsec": psf.plate_scale_arcsec,
@@ -91,49 +50,55 @@ def keep_psf(
             "components": sorted(psf.components),
             "cumulative_curve_pct": light_beyond_pct(psf.kernel),
             "provenance": psf.provenance,
-            "tables_sha256": keep_tables(psf, store, context.settings.threads),
             **details,
         },
+        {
+            "file": write or partial(write_psf, psf=psf),
+            "preview": draw or (lambda path: module_of_extra("psfcore.drawing.plots").psf_png(psf, path)),
+            "tables": partial(write_tables, psf=psf, threads=threads),
+            **({} if report is None else {"report": partial(write_json, content=report)}),
+        },
+        {
+            "name": psf.name,
+            "version": psf.version,
+            "instrument": psf.instrument,
+            "channel": channel,
+            "kind": kind,
+            "series": series_of(psf.instrument, channel, kind),
+            "status": PsfStatus.DRAFT,
+            "origin": origin,
+        },
     )
-    return context.add(row)
 
 
-def keep_tables(psf: Psf, store: Store, threads: int) -> str:
-    """Write the tables from which the service answers queries about a PSF; returns the SHA-256 of their file."""
+def write_tables(path: Path, *, psf: Psf, threads: int) -> None:
+    """Write the tables from which the service answers queries about a PSF."""
     # A deconvolution makes no tables, and does not load the libraries for them.
     from psfcore.tables.make import tables_of
 
-    with store.temporary() as path:
-        path.write_text(json.dumps(tables_of(psf, threads=threads), separators=(",", ":"), allow_nan=False))
-        return store.keep(path)
+    path.write_text(json.dumps(tables_of(psf, threads=threads), separators=(",", ":"), allow_nan=False))
 
 
-# Reports --------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Means:
-    """How a result is computed. job_id: the job that its provenance names. solution: gives the solution of the transit, see
-    `psfcore.scatter.inversion.Inverter`; None: it is computed."""
-
-    job_id: str
-    threads: int
-    progress: Progress
-    solution: Inverter | None = None
-
-
-@dataclass(frozen=True)
-class Finished:
-    """A finished report whose files are not yet written.
-
-    content: the report as JSON. details: the entry "sentence" and the main figures; lists of reports show them. draw: draws its
-    picture into a PNG file. page: makes the report as HTML; None if it has no page.
-    """
-
-    content: dict[str, Any]
-    details: dict[str, Any]
-    draw: Callable[[Path], object]
-    page: Callable[[], str] | None = None
+def report_result(
+    identity: str,
+    kind: str,
+    content: Mapping[str, Any],
+    details: Mapping[str, Any],
+    *,
+    draw: Write | None = None,
+    page: Callable[[], str] | None = None,
+    transit_id: str | None = None,
+    about_id: str | None = None,
+) -> Result:
+    """A report. content: its JSON. details: the entry "sentence" and the main figures; lists of reports show them. draw, page: make
+    its picture (PNG) and its page (HTML). transit_id, about_id: the transit, or the PSF or product, that it is about."""
+    files: dict[str, Write] = {"file": partial(write_json, content=content)}
+    if draw is not None:
+        files["preview"] = draw
+    if page is not None:
+        files["html"] = lambda path: path.write_text(page(), "utf-8")
+    columns = {"kind": kind, "transit_id": transit_id, "about_id": about_id}
+    return Result(ResultType.REPORT, identity, details, files, columns)
 
 
 def provenance_of(job_id: str, request: Parameters) -> dict[str, Any]:
@@ -147,69 +112,6 @@ def provenance_of(job_id: str, request: Parameters) -> dict[str, Any]:
         "libraries": library_versions(),
         "job_id": job_id,
     }
-
-
-def report_made(context: Context, identity: str) -> bool:
-    """Whether an earlier job has made the report with this identity."""
-    from workers.catalogue.tables import ReportRow  # a command with --local needs no catalogue
-
-    return context.made(ReportRow, identity) is not None
-
-
-def keep_report(context: Context, identity: str, kind: str, report: Finished, *, transit_id: str) -> None:
-    """Write the files of a report on a transit into the store, and add its row to the catalogue."""
-    store = context.store
-    with store.temporary() as text, store.temporary() as page, store.temporary() as picture:
-        write_json(text, report.content)
-        report.draw(picture)
-        of_page = {}
-        if report.page is not None:
-            page.write_text(report.page(), "utf-8")
-            of_page = {"page_sha256": store.keep(page)}
-        add_report(
-            context,
-            identity,
-            kind,
-            text=text,
-            details=report.details | of_page,
-            preview_sha256=store.keep(picture),
-            transit_id=transit_id,
-        )
-
-
-def add_report(
-    context: Context,
-    identity: str,
-    kind: str,
-    *,
-    text: Path,
-    details: dict[str, Any],
-    preview_sha256: str | None = None,
-    transit_id: str | None = None,
-    about_id: str | None = None,
-) -> None:
-    """Move the written JSON of a report into the store, and add its row to the catalogue.
-
-    details: see `Finished`. transit_id, about_id: the transit, or the PSF or product, that the report is about; reports can be
-    listed by these ids.
-    """
-    from workers.catalogue.tables import ReportRow  # a command with --local needs no catalogue
-
-    file_sha256 = context.store.keep(text)
-    context.add(
-        ReportRow(
-            owner=context.owner,
-            id=identity,
-            created_at=time.time(),
-            kind=kind,
-            transit_id=transit_id,
-            about_id=about_id,
-            file_sha256=file_sha256,
-            bytes=context.store.path(file_sha256).stat().st_size,
-            preview_sha256=preview_sha256,
-            details=details,
-        )
-    )
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:

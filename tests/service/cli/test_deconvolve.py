@@ -132,7 +132,7 @@ def test_what_does_not_fit_together_is_refused(folder: Path) -> None:
 def test_an_image_that_does_not_fit_into_the_memory_is_refused(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.cli.local.free_bytes", lambda: 2**16)
+    monkeypatch.setattr("workers.tasks.deconvolve.free_bytes", lambda: 2**16)
     image, out = folder / "in" / "0.fits", folder / "out.fits"
     refused = run("deconvolve", image, "-o", out, *options(folder))
     assert refused.exit_code == 1 and not out.exists()

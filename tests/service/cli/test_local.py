@@ -49,14 +49,14 @@ def test_files_are_read_in_place_and_only_as_they_were(tmp_path: Path) -> None:
             service.upload_transit(path)["id"] for path in (folder, tmp_path / "transit.tar")
         )
         assert in_place == archive
-        with service._transits[archive].folder() as place:
+        with service.inputs.transits[archive].folder() as place:
             assert place != folder.resolve() and (place / "transit.json").is_file()
         assert not place.exists()
         service.upload_transit(folder)
-        with service._transits[in_place].folder() as place:
+        with service.inputs.transits[in_place].folder() as place:
             assert place == folder.resolve()
         (folder / "transit.json").touch()
-        with pytest.raises(OSError, match="changed"), service._transits[in_place].folder():
+        with pytest.raises(OSError, match="changed"), service.inputs.transits[in_place].folder():
             pass
         with pytest.raises(DataError, match="no-manifest"):
             service.upload_transit(tmp_path)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import pytest
 
@@ -16,8 +15,8 @@ from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER
 from workers.files.store import Store
 from workers.settings import Settings
-from workers.tasks.context import Context
-from workers.tasks.results import add_report, write_json
+from workers.tasks.catalogue_workspace import CatalogueWorkspace
+from workers.tasks.results import report_result
 
 GAP_ID = "9a" * 32
 
@@ -30,12 +29,8 @@ def keep_gap_report(settings: Settings, owner: str = DEFAULT_OWNER) -> dict[str,
         patched.setattr(plot, "PLOT_DPI", 40)  # quicker to draw
         html = gap_page(found, said)
     catalogue, store = Catalogue(settings.catalogue_url), Store(settings.data_dir)
-    context = cast(Context, SimpleNamespace(owner=owner, store=store, add=catalogue.add))
-    with store.temporary() as text, store.temporary() as page:
-        write_json(text, said)
-        page.write_text(html, "utf-8")
-        details = {"sentence": said["sentence"], "page_sha256": store.keep(page)}
-        add_report(context, GAP_ID, "gap", text=text, details=details)
+    workspace = CatalogueWorkspace(catalogue, store, settings, owner, "j", lambda *_: None)
+    workspace.add(report_result(GAP_ID, "gap", said, {"sentence": said["sentence"]}, page=lambda: html))
     catalogue.close()
     return said
 

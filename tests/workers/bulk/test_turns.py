@@ -33,7 +33,7 @@ from workers.files import archive as archive_files
 from workers.files.store import open_store
 from workers.run.runner import Runner
 from workers.settings import Settings
-from workers.tasks.context import Context
+from workers.tasks.catalogue_workspace import CatalogueWorkspace
 
 WAIT_S = 30.0
 FEW = {"method": {"name": "richardson-lucy", "steps": 1}}
@@ -197,7 +197,7 @@ def test_a_search_that_was_stopped_at_every_step_finds_each_file_once(run: Run) 
     run.start("0/*.fits", "**/*.fits", "*/*.fits")
     bulks, lease, steps = run.catalogue.bulks, run.lease(), 0
     while (begun := bulks.begin_listing(run.id, lease)) is not None:
-        listing.list_files(_context(run, lease), begun, lambda: None, lambda: True)
+        listing.list_files(_workspace(run, lease), begun, lambda: None, lambda: True)
         steps += 1
         assert steps < 100
     run.catalogue.jobs.hand_back(lease)
@@ -306,12 +306,12 @@ def test_reading_computing_and_writing_overlap(run: Run, monkeypatch: pytest.Mon
     read_one, compute_one, write_one = task.read_one, task.compute_one, task.write_one
     threads: set[int] = set()
 
-    def reading(context: Any, bulk: Any, taken: Any) -> Any:
-        ready = read_one(context, bulk, taken)
+    def reading(workspace: Any, bulk: Any, taken: Any) -> Any:
+        ready = read_one(workspace, bulk, taken)
         read[taken.position].set()
         return ready
 
-    def compute(context: Any, ready: Any) -> Any:
+    def compute(workspace: Any, ready: Any) -> Any:
         number = number_of(ready)
         computing.set()
         threads.add(threading.get_ident())
@@ -319,14 +319,14 @@ def test_reading_computing_and_writing_overlap(run: Run, monkeypatch: pytest.Mon
         assert number == 0 or written[number - 1].wait(WAIT_S), (
             f"image {number - 1} was not written meanwhile"
         )
-        made = compute_one(context, ready)
+        made = compute_one(workspace, ready)
         computing.clear()
         return made
 
-    def write(context: Any, ready: Any, made: Any) -> Any:
+    def write(workspace: Any, ready: Any, made: Any) -> Any:
         number = number_of(ready)
         assert number == 3 or computing.wait(WAIT_S), f"image {number} was written before the next one began"
-        outcome = write_one(context, ready, made)
+        outcome = write_one(workspace, ready, made)
         written[number].set()
         return outcome
 
@@ -345,9 +345,9 @@ def test_an_image_in_its_second_attempt_has_no_neighbours(run: Run, monkeypatch:
     at_work: list[list[int]] = []
     compute_one = task.compute_one
 
-    def compute(context: Any, ready: Any) -> Any:
+    def compute(workspace: Any, ready: Any) -> Any:
         at_work.append([row.position for row in run.rows() if row.state == "taken"])
-        return compute_one(context, ready)
+        return compute_one(workspace, ready)
 
     monkeypatch.setattr(task, "compute_one", compute)
     run.turn()
@@ -360,12 +360,12 @@ def test_an_image_that_was_read_ahead_is_given_back(run: Run, monkeypatch: pytes
     begun = threading.Event()
     read_one = task.read_one
 
-    def reading(context: Any, bulk: Any, taken: Any) -> Any:
+    def reading(workspace: Any, bulk: Any, taken: Any) -> Any:
         if taken.position == 1:
             begun.set()
-        return read_one(context, bulk, taken)
+        return read_one(workspace, bulk, taken)
 
-    def compute(context: Any, ready: Any) -> Any:
+    def compute(workspace: Any, ready: Any) -> Any:
         assert begun.wait(WAIT_S)
         run.catalogue.bulks.pause(run.id)
         raise DataError("no-signal", "expected light; got none")
@@ -381,10 +381,10 @@ def test_an_error_of_writing_belongs_to_its_image(run: Run, monkeypatch: pytest.
     run.start_uploaded()
     write_one = task.write_one
 
-    def write(context: Any, ready: Any, made: Any) -> Any:
+    def write(workspace: Any, ready: Any, made: Any) -> Any:
         if number_of(ready) in (1, 3):
             raise DataError("output-not-written", "expected a folder; got a file")
-        return write_one(context, ready, made)
+        return write_one(workspace, ready, made)
 
     monkeypatch.setattr(task, "write_one", write)
     run.turn()
@@ -438,11 +438,11 @@ def _list_first_folder(run: Run, lease: Lease) -> None:
     begun = run.catalogue.bulks.begin_listing(run.id, lease)
     assert begun is not None
     steps = iter([False] * (1 + FOLDERS + IN_FOLDER) + [True])
-    listing.list_files(_context(run, lease), begun, lambda: None, lambda: next(steps))
+    listing.list_files(_workspace(run, lease), begun, lambda: None, lambda: next(steps))
 
 
-def _context(run: Run, lease: Lease) -> Context:
-    return Context(
+def _workspace(run: Run, lease: Lease) -> CatalogueWorkspace:
+    return CatalogueWorkspace(
         catalogue=run.catalogue, store=run.store, settings=run.settings, owner="local",
         job_id="j", report=lambda *_: None, lease=lease,
     )  # fmt: skip

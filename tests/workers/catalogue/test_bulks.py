@@ -31,7 +31,7 @@ from workers.contract.jobs import Fault, JobError
 from workers.files.store import Store
 from workers.intake.estimates import BULK, factor
 from workers.settings import Settings
-from workers.tasks.context import Context
+from workers.tasks.catalogue_workspace import CatalogueWorkspace
 
 B, C = ({"pattern": 0, "names": [name]} for name in "bc")  # places up to which files are listed
 BAD = JobError(fault=Fault.USER, code="bad", message="a bad image")
@@ -351,7 +351,7 @@ def test_paths_that_cannot_be_stored(catalogue: Catalogue, settings: Settings, t
         write_image(path)
     (root / "loop.fits").symlink_to(root / "loop.fits")
     bulk_id, lease = made(catalogue, 0, listed=False), turn(catalogue)
-    context = Context(
+    context = CatalogueWorkspace(
         catalogue=catalogue, store=Store(tmp_path / "data"), owner="o", job_id="j", lease=lease,
         settings=settings.model_copy(update={"bulk_roots": str(root)}), report=lambda *_: None,
     )  # fmt: skip

@@ -22,7 +22,7 @@ from workers.catalogue.followed import Place
 from workers.catalogue.tables import DEFAULT_OWNER, ImageRow, JobRow
 from workers.contract.jobs import Phase
 from workers.stage_timer import Spent
-from workers.tasks.context import Context
+from workers.tasks.catalogue_workspace import CatalogueWorkspace
 
 
 def test_the_counts_of_files_and_jobs(catalogue: Catalogue) -> None:
@@ -62,17 +62,17 @@ def test_times_of_many_attempts_are_summed(catalogue: Catalogue) -> None:
     }
 
 
-def fails(context: Context, _: Mapping[str, Any]) -> str:
+def fails(context: CatalogueWorkspace, _: Mapping[str, Any]) -> str:
     context.report("at work", 1, 2)
     raise DataError("bad", "no good")
 
 
-def passing(context: Context, _: Mapping[str, Any]) -> str:
+def passing(context: CatalogueWorkspace, _: Mapping[str, Any]) -> str:
     context.report("at work", 1, 2)
     raise ConnectionError
 
 
-def works(context: Context, _: Mapping[str, Any]) -> str:
+def works(context: CatalogueWorkspace, _: Mapping[str, Any]) -> str:
     context.report("at work", 1, 2)
     return "result"
 

@@ -24,7 +24,7 @@ from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER
 from workers.contract.jobs import Phase, Queue, broker_name
 from workers.settings import Settings
-from workers.tasks.context import Context
+from workers.tasks.catalogue_workspace import CatalogueWorkspace
 
 QUICK = {"lease_s": 3.0, "heartbeat_s": 0.2, "resubmit_s": 1.0, "worker_threads": 1}
 TASK = """
@@ -54,7 +54,7 @@ order.WAIT_S = 0.2
 def test_a_database_that_is_away_is_no_error_of_the_software(
     bench: Bench, error: Exception, phase: Phase
 ) -> None:
-    def task(_: Context, __: Mapping[str, Any]) -> str:
+    def task(_: CatalogueWorkspace, __: Mapping[str, Any]) -> str:
         raise error
 
     row = bench.run(task)

@@ -29,13 +29,13 @@ from workers.contract.jobs import Phase
 from workers.run.attempt import Attempt
 from workers.run.child import Stopping
 from workers.settings import Settings
-from workers.tasks.context import Context
+from workers.tasks.catalogue_workspace import CatalogueWorkspace
 
 
 def steps_for(seconds: float, at_work: Callable[[], None] = lambda: None) -> Task:
     """A task that says how far it is, again and again; ``at_work`` is called once it runs."""
 
-    def task(context: Context, _: Mapping[str, Any]) -> str:
+    def task(context: CatalogueWorkspace, _: Mapping[str, Any]) -> str:
         at_work()
         ends = time.monotonic() + seconds
         while time.monotonic() < ends:
@@ -67,7 +67,7 @@ def test_a_job_that_ends_in_time_is_let_end_and_asking_again_does_not_move_the_m
 
 
 def test_a_cancelled_job_is_not_handed_back(bench: Bench) -> None:
-    def cancelled(context: Context, _: Mapping[str, Any]) -> str:
+    def cancelled(context: CatalogueWorkspace, _: Mapping[str, Any]) -> str:
         bench.catalogue.jobs.cancel(context.job_id)
         bench.stopping.ask(0.0)
         return steps_for(60.0)(context, {})

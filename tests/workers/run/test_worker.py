@@ -31,7 +31,7 @@ from workers.contract.jobs import Phase, Queue
 from workers.run import worker
 from workers.run.attempt import COMPILING
 from workers.settings import Settings
-from workers.tasks.context import Context
+from workers.tasks.catalogue_workspace import CatalogueWorkspace
 
 LEASE_S, IDLE_S = 3.0, 6.0
 JOBS = 20
@@ -155,7 +155,7 @@ def test_a_job_that_compiles_says_so(tmp_path: Path, bench: Bench) -> None:
     files = KernelFiles(str(tmp_path), "f.py311", "source")
     stages: list[str] = []
 
-    def task(context: Context, _: Mapping[str, Any]) -> str:
+    def task(context: CatalogueWorkspace, _: Mapping[str, Any]) -> str:
         context.report("reading", 0, 20)
         for _time in range(2):
             if files.load(("float32",)) is None:

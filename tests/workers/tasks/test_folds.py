@@ -19,6 +19,7 @@ from workers.catalogue.jobs import Part, Parts
 from workers.catalogue.tables import JobRow, PartRow
 from workers.contract.jobs import Phase
 from workers.run.runner import Runner
+from workers.tasks import catalogue_workspace
 from workers.tasks import crossval as crossval_task
 
 ALL = [(run, fold) for run in range(3) for fold in range(3)]
@@ -37,8 +38,9 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(crossval_task, "exact_fit", fold)
     transit = SimpleNamespace(frames=FRAMES, sha256={})
     monkeypatch.setattr(crossval_task, "load_transit", lambda *_: (transit, None))
-    monkeypatch.setattr(crossval_task, "solved", lambda *_, **__: None)
-    monkeypatch.setattr(crossval_task, "WAIT_S", 0.01)
+    solution = SimpleNamespace(transit=transit)
+    monkeypatch.setattr(crossval_task, "solution_of", lambda *_, **__: solution)
+    monkeypatch.setattr(catalogue_workspace, "WAIT_S", 0.01)
 
 
 @pytest.fixture

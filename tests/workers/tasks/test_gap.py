@@ -133,15 +133,15 @@ def test_an_identical_request_gets_the_existing_report_and_a_rerun_adds_no_secon
 def test_a_job_whose_worker_was_lost_after_the_psf_was_saved_gives_one_result(
     service: InProcess, transit: Path, asked: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    keep_report, calls = gap_task.keep_report, []
+    report_result, calls = gap_task.report_result, []
 
-    def once_lost(*given: Any, **how: Any) -> None:
+    def once_lost(*given: Any, **how: Any) -> Any:
         calls.append(1)
         if len(calls) == 1:
             raise ConnectionError("the database is away")
-        keep_report(*given, **how)
+        return report_result(*given, **how)
 
-    monkeypatch.setattr(gap_task, "keep_report", once_lost)
+    monkeypatch.setattr(gap_task, "report_result", once_lost)
     row = service.diagnose_gap(transit, seed=4)
     assert len(calls) == len(asked) == 2
     assert ids(service, PsfRow).count(row["details"]["corrected_psf_id"]) == 1

@@ -19,17 +19,17 @@ from workers.catalogue.tables import ImageRow, SolutionRow
 from workers.contract.requests import PsfBuild, ResolvedCrossValidate, ResolvedPsfFit, ResolvedReport
 from workers.files.store import Store, StoreAway
 from workers.settings import Settings
-from workers.tasks import transits
-from workers.tasks.context import Context
-from workers.tasks.transits import solution_identity, solved
+from workers.tasks import solutions
+from workers.tasks.catalogue_workspace import CatalogueWorkspace
+from workers.tasks.solutions import solution_identity
 
 REQUEST = ResolvedPsfFit(transit_id="1" * 64)
 
 
 @pytest.fixture
-def context(catalogue: Catalogue, tmp_path: Path) -> Context:
+def workspace(catalogue: Catalogue, tmp_path: Path) -> CatalogueWorkspace:
     settings = Settings(data_dir=tmp_path, database_url=None, broker_url="filesystem://")
-    return Context(catalogue, Store(tmp_path), settings, "o", "j", report=lambda *_: None)
+    return CatalogueWorkspace(catalogue, Store(tmp_path), settings, "o", "j", report=lambda *_: None)
 
 
 @pytest.fixture
@@ -41,24 +41,28 @@ def inverted(monkeypatch: pytest.MonkeyPatch) -> list[Transit]:
         seen.append(transit)
         return small_transits.solved()
 
-    monkeypatch.setattr(transits, "invert", invert)
+    monkeypatch.setattr(solutions, "invert", invert)
     return seen
 
 
-def solve(context: Context, **how: Any) -> Solution:
+def solve(workspace: CatalogueWorkspace, **how: Any) -> Solution:
     request = how.pop("request", REQUEST)
     transit = how.pop("transit", small_transits.solved().transit)
     shape = how.pop("shape", SOFTENED_POWER_LAW)
-    return solved(context, request, transit, shape, progress=lambda *_: None, **how)
+    start = how.pop("start", None)
+    solved = workspace.inverter(request)
+    return solved(transit, shape, start=start, threads=1, progress=lambda *_: None)
 
 
-def row(context: Context) -> SolutionRow:
-    (found,) = context.catalogue.owners.solutions_before(np.inf)
+def row(workspace: CatalogueWorkspace) -> SolutionRow:
+    (found,) = workspace.catalogue.owners.solutions_before(np.inf)
     return found
 
 
-def test_later_jobs_of_the_same_owner_share_it(context: Context, inverted: list[Transit]) -> None:
-    first, second = solve(context), solve(dataclasses.replace(context, job_id="other"))
+def test_later_jobs_of_the_same_owner_share_it(
+    workspace: CatalogueWorkspace, inverted: list[Transit]
+) -> None:
+    first, second = solve(workspace), solve(dataclasses.replace(workspace, job_id="other"))
     assert len(inverted) == 1
     assert first.inversion.coordinates.tobytes() == second.inversion.coordinates.tobytes()
     assert [s.tobytes() for s in first.sky.scenes] == [s.tobytes() for s in second.sky.scenes]
@@ -67,18 +71,18 @@ def test_later_jobs_of_the_same_owner_share_it(context: Context, inverted: list[
         ResolvedCrossValidate(transit_id="1" * 64, runs=2),
         ResolvedReport(transit_id="1" * 64, dark_offsets=False),
     ):
-        solve(context, request=request)
+        solve(workspace, request=request)
     assert len(inverted) == 1
-    solve(dataclasses.replace(context, owner="p"))
+    solve(dataclasses.replace(workspace, owner="p"))
     assert len(inverted) == 2
 
 
-def test_a_rerun_neither_uses_nor_keeps_one(context: Context, inverted: list[Transit]) -> None:
+def test_a_rerun_neither_uses_nor_keeps_one(workspace: CatalogueWorkspace, inverted: list[Transit]) -> None:
     for runs, kept in ((1, 0), (3, 1)):
-        solve(dataclasses.replace(context, anew=True))
+        solve(dataclasses.replace(workspace, anew=True))
         assert len(inverted) == runs
-        assert len(context.catalogue.owners.solutions_before(np.inf)) == kept
-        solve(context)
+        assert len(workspace.catalogue.owners.solutions_before(np.inf)) == kept
+        solve(workspace)
 
 
 def test_everything_that_determines_a_solution_is_in_its_identity(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -103,7 +107,7 @@ def test_everything_that_determines_a_solution_is_in_its_identity(monkeypatch: p
         ("library_versions", dict),
     ):
         with monkeypatch.context() as patched:
-            patched.setattr(transits, name, other)
+            patched.setattr(solutions, name, other)
             made.append(solution_identity(REQUEST, transit, shape, None))
     assert len(set(made)) == len(made) == 11
     assert solution_identity(REQUEST, transit, shape, None) == made[0]
@@ -113,40 +117,42 @@ def damage(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-1000])
 
 
-def test_one_that_cannot_be_read_is_made_and_kept_again(context: Context, inverted: list[Transit]) -> None:
-    solve(context)
+def test_one_that_cannot_be_read_is_made_and_kept_again(
+    workspace: CatalogueWorkspace, inverted: list[Transit]
+) -> None:
+    solve(workspace)
     for runs, spoil in ((2, Path.unlink), (3, damage)):
-        spoil(context.store.path(row(context).file_sha256))
-        solve(context)
-        solve(context)
+        spoil(workspace.store.path(row(workspace).file_sha256))
+        solve(workspace)
+        solve(workspace)
         assert len(inverted) == runs
-        assert context.catalogue.owners.usage("o", 0).used_bytes == row(context).bytes
+        assert workspace.catalogue.owners.usage("o", 0).used_bytes == row(workspace).bytes
 
 
 def test_storage_that_does_not_answer_costs_time_only(
-    context: Context, inverted: list[Transit], monkeypatch: pytest.MonkeyPatch
+    workspace: CatalogueWorkspace, inverted: list[Transit], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def away(*_: object) -> Path:
         raise StoreAway("away")
 
-    solve(context)
+    solve(workspace)
     for name in ("path", "keep"):
-        monkeypatch.setattr(context.store, name, away)
-    solve(context)
+        monkeypatch.setattr(workspace.store, name, away)
+    solve(workspace)
     monkeypatch.undo()
-    assert row(context), "the row stays: the file may still be there"
+    assert row(workspace), "the row stays: the file may still be there"
 
 
 def test_without_room_or_if_it_is_too_large_it_is_not_kept_and_the_job_goes_on(
-    context: Context, inverted: list[Transit], monkeypatch: pytest.MonkeyPatch
+    workspace: CatalogueWorkspace, inverted: list[Transit], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patched:
         patched.setattr("psfcore.scatter.kept.MOST_BYTES", 1000)
-        solve(context)
-    assert context.catalogue.owners.solutions_before(np.inf) == [] == list(context.store.blobs())
+        solve(workspace)
+    assert workspace.catalogue.owners.solutions_before(np.inf) == [] == list(workspace.store.blobs())
     image = ImageRow(owner="o", id="2" * 64, created_at=1.0, bytes=2**19, summary={})
-    context.catalogue.owners.set_quota("o", 1)
-    context.catalogue.add(image)
-    solve(context)
-    assert context.catalogue.owners.solutions_before(np.inf) == []
-    assert context.catalogue.owners.usage("o", 0).used_bytes == image.bytes
+    workspace.catalogue.owners.set_quota("o", 1)
+    workspace.catalogue.add(image)
+    solve(workspace)
+    assert workspace.catalogue.owners.solutions_before(np.inf) == []
+    assert workspace.catalogue.owners.usage("o", 0).used_bytes == image.bytes

@@ -118,9 +118,9 @@ def test_an_image_over_a_limit_fails_like_a_single_job(
     worked_on: list[tuple[int, ...]] = []
     make = deconvolve_task.make
 
-    def seen(context: Any, request: Any, psf_row: Any, image: Any, **more: Any) -> Any:
-        worked_on.append(image.pixels.shape)
-        return make(context, request, psf_row, image, **more)
+    def seen(workspace: Any, request: Any, read: Any, **more: Any) -> Any:
+        worked_on.append(read().pixels.shape)
+        return make(workspace, request, read, **more)
 
     monkeypatch.setattr(deconvolve_task, "make", seen)
     with TestClient(create_app(limited)) as api:
@@ -150,9 +150,9 @@ def test_an_image_that_takes_too_long_fails_but_a_turn_may_last_longer(
     monkeypatch.setattr(bulk_task, "TELL_EVERY_S", 0.0)
     make = deconvolve_task.make
 
-    def slow(context: Any, request: Any, psf_row: Any, image: Any, **more: Any) -> Any:
-        clock.ahead_s += 100.0 if image.pixels.shape == (80, 128) else 20.0
-        return make(context, request, psf_row, image, **more)
+    def slow(workspace: Any, request: Any, read: Any, **more: Any) -> Any:
+        clock.ahead_s += 100.0 if read().pixels.shape == (80, 128) else 20.0
+        return make(workspace, request, read, **more)
 
     monkeypatch.setattr(deconvolve_task, "make", slow)
     with TestClient(create_app(limited)) as api:

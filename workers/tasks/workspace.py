@@ -1,0 +1,139 @@
+"""The workspace of a task: where the task finds its inputs, and where it puts its results.
+
+A task knows this interface alone. A service implements it on the catalogue and the store
+(`workers.tasks.catalogue_workspace`), a command with ``--local`` on the user's files (`service.cli.local`).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from psfcore.fits.blocks import FitsLimits
+from workers.contract.kinds import ResultType
+from workers.contract.requests import PsfBuild, ResolvedDeconvolve, ResolvedOnTransit
+from workers.settings import Settings
+from workers.stage_timer import StageTimer
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from psfcore.deconvolve.run import PsfSource
+    from psfcore.psf import Psf
+    from psfcore.recipe import Recipe
+    from psfcore.scatter.inversion import Inverter
+
+Progress = Callable[[str, int, int], None]
+Json = dict[str, Any]
+PARTS = "folds"  # the stage of the parts of a job
+
+
+class TurnOver(Exception):
+    """A turn of a bulk run ends before all images are done, so that other jobs can run. The job of the turn is queued
+    again as if it had not started."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """A result of a task, whose files are not yet written.
+
+    details: the entries that describe it. files: functions that write its files, by name, in the order in which they
+    are written: "file" is the result itself, "preview" its picture (PNG), "html" its page. columns: the further columns of its row
+    in a catalogue.
+    """
+
+    type: ResultType
+    id: str
+    details: Mapping[str, Any]
+    files: Mapping[str, Callable[[Path], object]]
+    columns: Mapping[str, Any] = field(default_factory=dict)
+
+
+class Workspace(ABC):
+    """What every task may use.
+
+    report(stage, step, steps): reports progress; raises an exception if the job must stop. times: measures the time of the
+    reported stages. If the pieces of a job report their own stages, the time of these stages is measured instead. anew: True
+    for a rerun: compute everything again.
+    """
+
+    settings: Settings
+    job_id: str
+    report: Progress
+    times: StageTimer
+    anew: bool
+
+    @property
+    @abstractmethod
+    def threads(self) -> int:
+        """Threads of a computation."""
+
+    @property
+    @abstractmethod
+    def limits(self) -> FitsLimits:
+        """Limits for the FITS files that a task opens."""
+
+    @abstractmethod
+    def has(self, result: ResultType, identity: str) -> bool:
+        """Whether an earlier job made this result, and all its files are there. If not, the task makes the result."""
+
+    @abstractmethod
+    def add(self, result: Result) -> None:
+        """Add a result; the workspace writes its files, now or when they are asked for."""
+
+    @abstractmethod
+    def image_file(self, identity: str) -> Path:
+        """The file of an uploaded image. Raises DataError "no-such-image"."""
+
+    def shape_to_check(self, request: ResolvedDeconvolve) -> tuple[int, int] | None:
+        """The shape (ny, nx) of an image that must fit into the free memory; None: this was checked when the job was submitted."""
+        return None
+
+    @abstractmethod
+    def psf_source(self, request: ResolvedDeconvolve) -> PsfSource:
+        """The PSF of a deconvolution, without its components. Raises DataError "no-such-psf"."""
+
+    @abstractmethod
+    def psf(self, identity: str, *, parts: bool = True) -> Psf:
+        """The PSF with this id; parts: whether with its components and errors. Raises DataError "no-such-psf"."""
+
+    def build(
+        self, recipe: Recipe, mount_image: NDArray[Any] | None, progress: Callable[[int, int], None]
+    ) -> tuple[Psf, Callable[[Path], object]]:
+        """The PSF of a recipe, and a function that writes its file. mount_image: the pixels of the mask image of its mount, if
+        it has one."""
+        # Most jobs do not load the libraries of the diffraction.
+        from psfcore.build import build_recipe
+        from psfcore.fits.psfs import write_psf
+
+        psf = build_recipe(recipe, mount_image=mount_image, threads=self.threads, progress=progress)
+        return psf, partial(write_psf, psf=psf, instrument_file=recipe.text.encode())
+
+    @abstractmethod
+    def built_psf(self, build: PsfBuild) -> Psf:
+        """The PSF of a recipe without its components; it is built if it does not exist."""
+
+    @abstractmethod
+    def unpacked(self, transit_id: str) -> AbstractContextManager[tuple[Path, int]]:
+        """A folder with the files of a transit, and the number of its images. Raises DataError "no-such-transit"."""
+
+    def inverter(self, request: ResolvedOnTransit) -> Inverter | None:
+        """A function that gives the solution of the request's transit which an earlier job kept; None: it is computed."""
+        return None
+
+    def parts(self, identity: str, count: int, compute: Callable[[int, Progress], Json]) -> Sequence[Json]:
+        """The results of all parts of a job: ``compute(number, progress)`` for each number below ``count``.
+
+        identity: of the job's result; other workers may compute parts of it.
+        """
+        done: list[Json] = []
+        for number in range(count):
+            self.report(PARTS, number, count)
+            done.append(compute(number, lambda *_: self.report(PARTS, len(done), count)))
+        self.report(PARTS, count, count)
+        return done
