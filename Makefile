@@ -1,26 +1,27 @@
 # `make demo` and `make test` are the commands of the README; each sets up its own environment.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
+CONSTRAINTS := constraints.txt
 BIN := $(VENV)/bin
 RUN := $(VENV)/.installed
 DEV := $(VENV)/.installed-dev
 DOCS := $(VENV)/.installed-docs
 
-.PHONY: demo test test-fast test-full browser bench bench-peers blind chaos lint lines docs openapi settings pins clean
+.PHONY: demo test test-fast test-full test-oldest test-newest coverage browser bench bench-peers blind chaos lint lines docs openapi settings pins package container release clean
 .DELETE_ON_ERROR:
 
-$(RUN): pyproject.toml constraints.txt
+$(RUN): pyproject.toml $(CONSTRAINTS)
 	$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "heliopsf needs Python 3.11 or newer, found " + sys.version.split()[0] + ": make PYTHON=/path/to/python3.11")'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[service]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS) -e '.[service]'
 	touch $@
 
 $(DEV): $(RUN)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS) -e '.[dev]'
 	touch $@
 
 $(DOCS): $(RUN)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS) -e '.[docs]'
 	touch $@
 
 demo: $(RUN)
@@ -41,6 +42,19 @@ browser:
 
 test-full: $(DEV)
 	$(BIN)/python -m pytest -n 2 --dist loadfile tests
+
+# The fast tests with the oldest dependencies that pyproject.toml allows, and with the newest that there are, each in its own environment.
+test-oldest:
+	$(MAKE) test VENV=.venv-oldest CONSTRAINTS=constraints-oldest.txt
+
+test-newest:
+	$(MAKE) test VENV=.venv-newest CONSTRAINTS=/dev/null
+
+# The share of branches that the fast tests run, by room, into the table of CONTRIBUTING.md.
+coverage: $(DEV)
+	$(BIN)/python -m coverage erase
+	$(BIN)/python -m pytest -m "not slow" -n 3 --dist loadfile --ignore tests/house --cov --cov-report= tests
+	$(BIN)/python -m tests.house.coverage CONTRIBUTING.md
 
 # Each figure beside its goal and the stored one; needs 20 minutes and no other program on the machine.
 bench: $(DEV)
@@ -86,10 +100,35 @@ settings: $(DEV)
 openapi: $(DEV)
 	$(BIN)/python -m service.openapi openapi/openapi.json
 
+# The oldest versions of all packages that pyproject.toml allows.
+constraints-oldest.txt: pyproject.toml
+	test -x .venv-pins/bin/uv || { $(PYTHON) -m venv .venv-pins && .venv-pins/bin/python -m pip install --quiet --disable-pip-version-check uv; }
+	.venv-pins/bin/uv pip compile --quiet --python-version 3.11 --resolution lowest-direct --no-header --no-annotate --extra dev -o $@ pyproject.toml
+
+# Wheel and source archive in dist/, checked, installed into an empty environment, and the demo run from there.
+package: $(DEV)
+	rm -rf dist
+	$(BIN)/python -m build --no-isolation --outdir dist .
+	$(BIN)/python -m twine check --strict dist/*
+	rm -rf .venv-wheel && $(PYTHON) -m venv .venv-wheel
+	.venv-wheel/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt "$$(ls dist/*.whl)[service]"
+	cd dist && ../.venv-wheel/bin/heliopsf demo -o demo
+	rm -rf dist/demo .venv-wheel
+
+# The image, and its demo.
+container:
+	docker build --tag heliopsf .
+	docker run --rm --volume /data heliopsf heliopsf demo -o /data/demo
+
+# Cuts a release, for example: make release VERSION=0.2.0
+release:
+	$(if $(VERSION),,$(error expected the version: make release VERSION=0.2.0))
+	bash deploy/release.sh "$(VERSION)" "$(PYTHON)"
+
 # The hashes of the pinned packages and of the build tool, for the image. The file names no index.
 pins: constraints.txt pyproject.toml pins/build.in
 	test -x .venv-pins/bin/uv || { $(PYTHON) -m venv .venv-pins && .venv-pins/bin/python -m pip install --quiet --disable-pip-version-check uv; }
 	.venv-pins/bin/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate -c constraints.txt --extra s3 --extra traces -o pins/service.txt pyproject.toml pins/build.in
 
 clean:
-	rm -rf $(VENV) .venv-peers .venv-pins .mypy_cache .ruff_cache .hypothesis docs/_build docs/_gallery
+	rm -rf $(VENV) .venv-oldest .venv-newest .venv-wheel .venv-peers .venv-pins dist .mypy_cache .ruff_cache .hypothesis docs/_build docs/_gallery
