@@ -30,7 +30,7 @@ from service.api.bulk import find as find_bulk
 from service.api.jobs import JobId
 from service.api.jobs import find as find_job
 from service.http.callers import Caller, Reading, still_let_in
-from service.http.lookout import Follower, Key, Kind, Lookout, OwnerFollower, RowFollower, version
+from service.http.lookout import Follower, Key, Kind, Lookout, OwnerFollower, version
 from service.http.problems import RESPONSES
 from service.http.state import Shared
 from service.views import JobView
@@ -96,7 +96,7 @@ def _stream_of(
     """The stream of one job or bulk run."""
     if row.ended_at is not None and version(row.changed_at) == last_id:
         return Response(status_code=204)  # the client has the last event; it tells a browser not to reconnect
-    return _stream(request, state, caller, RowFollower(caller, key, last_id))
+    return _stream(request, state, caller, Follower(caller, {key: last_id or ""}))
 
 
 def _stream(request: Request, state: Shared, caller: Caller, follower: Follower) -> Response:

@@ -52,11 +52,6 @@ class State:
     ended: bool
     data: str
 
-    @classmethod
-    def of(cls, row: Any, kind: Kind[Any]) -> State:
-        """The state of a row."""
-        return cls(version(row.changed_at), row.ended_at is not None, kind.view(row).model_dump_json())
-
 
 def version(changed_at: float) -> str:
     """The version of a row that changed at this time."""
@@ -75,18 +70,21 @@ class Sight:
 
 
 class Follower:
-    """A stream of events, as the lookout of its owner sees it. said: the texts that the client has not got yet.
+    """A stream of the events of one job or bulk run, until it reaches its final state or is deleted, as the lookout of its owner
+    sees it.
 
-    caller: whose key must stay valid. known: the versions that the client knows; "": none yet; None: the deletion. whole: whether it
-    follows all jobs and bulk runs of the owner, or only those in ``known``. after: as in ``Sight``; None: the last seconds. begun:
-    whether it has looked. joined: whether its own looks have ended, so that the lookout looks for it too.
+    caller: whose key must stay valid. known: the versions that the client knows; "": none yet; None: the deletion. whole: whether the
+    stream follows all jobs and bulk runs of the owner, or only those in ``known``. after: as in ``Sight``; None: the last seconds.
+    begun: whether it has looked. joined: whether its own looks have ended, so that the lookout looks for it too. said: the texts that
+    the client has not got yet.
     """
 
     whole = False
 
-    def __init__(self, caller: Hashable, known: Mapping[Key, str | None]) -> None:
-        self.caller, self.known = caller, dict(known)
-        self.after: Sequence[Moment] | None = None
+    def __init__(
+        self, caller: Hashable, known: Mapping[Key, str | None], after: Sequence[Moment] | None = None
+    ) -> None:
+        self.caller, self.known, self.after = caller, dict(known), after
         self.begun = self.joined = False
         self.said: asyncio.Queue[Said] = asyncio.Queue(MOST_UNREAD)
 
@@ -96,8 +94,15 @@ class Follower:
         return [key for key in followed if versions.get(key) != self.known.get(key)]
 
     def say(self, sight: Sight) -> Said:
-        """The events for what the client does not know; afterwards the client knows it."""
-        raise NotImplementedError
+        """The events for what the client does not know; afterwards the client knows it. The id of an event is a version."""
+        for key in self.news(sight.versions, ()):
+            state = sight.states.get(key)
+            if state is None:
+                return "event: gone\ndata: {}\n\n", True
+            self.known[key] = state.version
+            name = "end" if state.ended else "progress"
+            return f"id: {state.version}\nevent: {name}\ndata: {state.data}\n\n", state.ended
+        return "", False
 
     def tell(self, said: Said) -> None:
         """Pass a text to the stream, or its end if the client is too slow. A look without news only wakes the stream."""
@@ -109,33 +114,14 @@ class Follower:
             self.said.put_nowait(said)
 
 
-class RowFollower(Follower):
-    """Follows one job or bulk run, until it reaches its final state or is deleted."""
-
-    def __init__(self, caller: Hashable, key: Key, last_id: str | None) -> None:
-        """last_id: the id of the last event that the client received; ids are versions."""
-        super().__init__(caller, {key: last_id or ""})
-
-    def say(self, sight: Sight) -> Said:
-        """The event for the job or bulk run."""
-        for key in self.news(sight.versions, ()):
-            state = sight.states.get(key)
-            if state is None:
-                return "event: gone\ndata: {}\n\n", True
-            self.known[key] = state.version
-            name = "end" if state.ended else "progress"
-            return f"id: {state.version}\nevent: {name}\ndata: {state.data}\n\n", state.ended
-        return "", False
-
-
 class OwnerFollower(Follower):
-    """Follows all jobs and bulk runs of its owner. named: those that the request names."""
+    """A stream of the events of all jobs and bulk runs of an owner. named: those that the request names."""
 
     whole = True
 
     def __init__(self, caller: Hashable, named: Collection[Key], after: Sequence[Moment] | None) -> None:
-        super().__init__(caller, dict.fromkeys(named, ""))
-        self.named, self.after = frozenset(named), after
+        super().__init__(caller, dict.fromkeys(named, ""), after)
+        self.named = frozenset(named)
 
     def say(self, sight: Sight) -> Said:
         """The events, those for the named first.
@@ -150,10 +136,13 @@ class OwnerFollower(Follower):
             if key in sight.states or key in self.known
         ]
         at = min(at for at, _ in sight.after)
-        self._forget(at)
         said = f"id: {math.floor(at * 1000) / 1000:.3f}\n"  # rounded down, so that no change is left out
         if not events:
             return "" if self.begun else f"{said}\n", False
+        # What the next looks read again is not forgotten, otherwise it would be told again.
+        old = [key for key, told in self.known.items() if told and float(told) <= at]
+        for key in [one for one in old if one not in self.named][:-MOST_KNOWN]:
+            del self.known[key]
         return "".join(events[:-1]) + said + events[-1], False
 
     def _event(self, key: Key, state: State | None) -> str:
@@ -164,17 +153,6 @@ class OwnerFollower(Follower):
         if state is None:
             return f'event: gone\ndata: {{"kind":"{kind}","id":"{identity}"}}\n\n'
         return f"event: {kind}\ndata: {state.data}\n\n"
-
-    def _forget(self, at: float) -> None:
-        """Forget what was told first, except the named and what the next looks read again."""
-        if len(self.known) > MOST_KNOWN:
-            old = [
-                key
-                for key, told in self.known.items()
-                if told and float(told) <= at and key not in self.named
-            ]
-            for key in old[: max(0, len(old) - MOST_KNOWN)]:
-                del self.known[key]
 
 
 class Lookout:
@@ -273,7 +251,9 @@ class Lookout:
         versions = changed | others
         unknown = {key for one in followers for key in one.news(versions, changed)}
         states = {
-            (kind.name, row.id): State.of(row, kind)
+            (kind.name, row.id): State(
+                version(row.changed_at), row.ended_at is not None, kind.view(row).model_dump_json()
+            )
             for kind in self._kinds
             for row in kind.changes.rows(_ids(unknown & versions.keys(), kind))
         }

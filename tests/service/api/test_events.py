@@ -22,7 +22,7 @@ from service.api import events
 from service.client.http import ServiceError
 from service.http import lookout
 from service.http.callers import Caller
-from service.http.lookout import Follower, Kind, Lookout, OwnerFollower, RowFollower
+from service.http.lookout import Follower, Kind, Lookout, OwnerFollower
 from service.views import JobView
 from tests.service.conftest import execute, refusal
 from tests.service.keyed import bearer, keyed
@@ -352,7 +352,7 @@ def test_all_streams_of_an_owner_need_as_few_queries_as_one(
     async def queries(many: int) -> int:
         seen = lookout_of(catalogue, lambda caller: catalogue.keys.is_good(caller.name) or True)
         followers: list[Follower] = [follower_of() for _ in range(many)]
-        followers += [RowFollower(CALLER, ("job", one), None) for one in ids[:many]]
+        followers += [Follower(CALLER, {("job", one): ""}) for one in ids[:many]]
         assert all([(await seen.next(one))[0] for one in followers])
         statements.clear()
         assert {await seen.next(one) for one in followers} == {("", False)}
