@@ -45,14 +45,14 @@ router = APIRouter(tags=["events"], responses=RESPONSES)
 LastId = Annotated[str | None, Header(alias="Last-Event-ID", max_length=64)]
 Id = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{32}$")]
 Moment = Annotated[str | None, Header(alias="Last-Event-ID", pattern=r"^[0-9]{1,12}\.[0-9]{3}$")]
-DESCRIBED: dict[int | str, dict[str, Any]] = {
+STREAM: dict[int | str, dict[str, Any]] = {
     200: {
         "description": "Events `progress`. The data of each event is the complete job or bulk run. The last event is `end`.",
         "content": {TYPE: {}},
     },
     204: {"description": "The last event that the client received was `end`; no more events follow."},
 }
-DESCRIBED_OF_OWNER: dict[int | str, dict[str, Any]] = {
+STREAM_OF_OWNER: dict[int | str, dict[str, Any]] = {
     200: {
         "description": "Events `job` and `bulk` are sent for new and changed jobs and bulk runs; the data is the complete job "
         'or bulk run. Events `gone` are sent for deleted ones; the data is {"kind": "job" or "bulk", "id": ...}. '
@@ -66,7 +66,7 @@ DESCRIBED_OF_OWNER: dict[int | str, dict[str, Any]] = {
     "/v1/jobs/{job_id}/events",
     summary="The progress of a job as events",
     response_class=Response,
-    responses=DESCRIBED,
+    responses=STREAM,
 )
 async def follow_job(
     job_id: JobId, request: Request, caller: Reading, state: Shared, last_id: LastId = None
@@ -80,7 +80,7 @@ async def follow_job(
     "/v1/bulk/{bulk_id}/events",
     summary="The progress of a bulk run as events",
     response_class=Response,
-    responses=DESCRIBED,
+    responses=STREAM,
 )
 async def follow_bulk(
     bulk_id: BulkId, request: Request, caller: Reading, state: Shared, last_id: LastId = None
@@ -153,7 +153,7 @@ class _Stream(StreamingResponse):
     "/v1/events",
     summary="The progress of all your jobs and bulk runs as events",
     response_class=Response,
-    responses=DESCRIBED_OF_OWNER,
+    responses=STREAM_OF_OWNER,
 )
 async def follow_all(
     request: Request,

@@ -249,7 +249,7 @@ def _place(one: Affected) -> tuple[str, ...]:
 # --- contexts -------------------------------------------------------------------------------------------
 
 
-class ContextAsked(BaseModel):
+class NewContext(BaseModel):
     """A context to create: it pins the given PSFs, or all PSFs that are certified now."""
 
     model_config = ConfigDict(extra="forbid")
@@ -298,7 +298,7 @@ class WholeContext(ContextView):
     pins: list[PinView] = Field(description="PSFs of the context, sorted by series and time")
 
 
-class DefaultAsked(BaseModel):
+class DefaultContext(BaseModel):
     """The new default context, from which the PSF for an image is chosen."""
 
     model_config = ConfigDict(extra="forbid")
@@ -330,7 +330,7 @@ class DefaultView(BaseModel):
     summary="Create a context",
     responses={200: {"model": WholeContext, "description": "The same context already exists."}},
 )
-def create_context(body: ContextAsked, response: Response, caller: Certifying, state: Shared) -> WholeContext:
+def create_context(body: NewContext, response: Response, caller: Certifying, state: Shared) -> WholeContext:
     """Pin PSFs under a name: the given PSFs, or all PSFs that are certified now."""
     with as_problems():
         row, new = state.catalogue.contexts.create(
@@ -361,7 +361,7 @@ def get_default_context(caller: Reading, state: Shared) -> DefaultView:
 
 
 @contexts.put("/default", summary="Change the default context")
-def move_default_context(body: DefaultAsked, caller: Certifying, state: Shared) -> DefaultView:
+def move_default_context(body: DefaultContext, caller: Certifying, state: Shared) -> DefaultView:
     """Set the default context. If `context` is null, there is no default. The history of changes is kept."""
     with as_problems():
         state.catalogue.contexts.set_default(body.context, caller.owner, caller.name, body.reason)

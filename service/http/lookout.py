@@ -28,7 +28,7 @@ OVERLAP_S = 10.0
 # Texts that wait for a client. A stream whose client is slower ends, and the client connects again.
 MOST_UNREAD = 16
 # Jobs and bulk runs whose deletion a stream reports: those that changed last, and those that the request names.
-MOST_KNOWN = 1000
+MOST_KNOWN = 300
 
 # The next text of a stream, empty if nothing has changed; and whether the stream ends after it.
 Said = tuple[str, bool]

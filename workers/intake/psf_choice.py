@@ -43,7 +43,7 @@ MOST_SEARCHED = 500
 
 
 @dataclass(frozen=True)
-class Found:
+class SearchResult:
     """The result of a search for one PSF."""
 
     wanted: PsfFilter
@@ -113,7 +113,7 @@ class Found:
         return {name: value for name, value in said.items() if value is not None}
 
 
-def look(catalogue: Catalogue, wanted: PsfFilter, owner: str, context: str | None) -> Found:
+def look(catalogue: Catalogue, wanted: PsfFilter, owner: str, context: str | None) -> SearchResult:
     """The PSFs that meet the filters. context: an id, a name or "now"; None: the owner's default context.
 
     If there is no context, and the filters name no status, only certified PSFs are searched.
@@ -123,18 +123,18 @@ def look(catalogue: Catalogue, wanted: PsfFilter, owner: str, context: str | Non
     return _look(catalogue, wanted, owner, catalogue.contexts.asked_for(context, owner))
 
 
-def _look(catalogue: Catalogue, wanted: PsfFilter, owner: str, pinned: PsfContextRow | None) -> Found:
+def _look(catalogue: Catalogue, wanted: PsfFilter, owner: str, pinned: PsfContextRow | None) -> SearchResult:
     if pinned is not None:
         wanted = replace(wanted, context_id=pinned.id)
     elif wanted.status is None:
         wanted = replace(wanted, status=PsfStatus.CERTIFIED)
     psfs = catalogue.psfs.page(wanted, owner, limit=MOST_NAMED + 1)
-    return Found(wanted, pinned, psfs, None if psfs else catalogue.psfs.emptied_by(wanted, owner))
+    return SearchResult(wanted, pinned, psfs, None if psfs else catalogue.psfs.emptied_by(wanted, owner))
 
 
 def look_for_image(
     catalogue: Catalogue, header: Mapping[str, Any], owner: str, context: str | None, kind: str = TOTAL
-) -> Found:
+) -> SearchResult:
     """The PSFs for the instrument, channel and time of an image. header: the header summary that is stored with the upload.
 
     If the channel has variants, the filter and the plate scale in the header choose the variant.
@@ -156,7 +156,7 @@ def _look_at_time_of(
     catalogue: Catalogue,
     owner: str,
     pinned: PsfContextRow | None,
-) -> Found:
+) -> SearchResult:
     """The PSFs of a series at the time of an image. Raises ``DataError`` "no-date"."""
     try:
         at = seconds(header["date_obs"] or "")
@@ -179,7 +179,7 @@ def _look_at_time_of(
 
 def picked_for_image(
     catalogue: Catalogue, header: Mapping[str, Any], owner: str, context: str | None
-) -> Found | None:
+) -> SearchResult | None:
     """Find the PSF for an image if the request names no PSF; None if the series of the image has no certified PSF.
 
     Raises the same ``DataError`` as ``look_for_image``, and "no-psf-fits" if the series has PSFs, but the context contains none of them.

@@ -26,7 +26,7 @@ from workers.contract.psf_status import Pin, StatusChange
 from workers.contract.requests import Parameters, PsfBuild, PsfFit, ResolvedDeconvolve
 from workers.intake import requests
 from workers.intake.compatibility import check, details_now, suits
-from workers.intake.requests import Asked, resolve_by_ids
+from workers.intake.requests import Submission, resolve_by_ids
 from workers.intake.uploads import image_row, uploaded_psf_row
 from workers.versions import PsfStatus
 
@@ -218,7 +218,7 @@ class Two(Parameters):
 
 def resolved(catalogue: Catalogue, **parameters: str) -> Parameters:
     kind = Kind("two", task="", result=Result.REPORT, parameters=Two, resolved=Two)
-    return resolve_by_ids(Asked(kind, Two(**parameters), catalogue, OWNER, ()))
+    return resolve_by_ids(Submission(kind, Two(**parameters), catalogue, OWNER, ()))
 
 
 def test_every_id_is_checked(catalogue: Catalogue) -> None:
