@@ -14,11 +14,11 @@ from typing import Any
 import httpx
 import pytest
 from fastapi.testclient import TestClient
-from pydantic import BaseModel
 from sqlalchemy import Engine, event, update
 from sqlalchemy.exc import OperationalError
 
 from service.api import events
+from service.api.bulk import BulkLine
 from service.client.http import ServiceError
 from service.http import lookout
 from service.http.callers import Caller
@@ -139,23 +139,17 @@ def catalogue(settings: Settings) -> Iterator[Catalogue]:
     catalogue.close()
 
 
-class Line(BaseModel):
-    id: str
-    phase: str
-
-    @classmethod
-    def of(cls, row: BulkRow) -> Line:
-        return cls(id=row.id, phase=row.phase)
-
-
-def lookout_of(catalogue: Catalogue, let_in: Callable[[Any], bool] = lambda _: True) -> Lookout:
-    """For the jobs of the owner."""
-    kinds = [Kind("job", catalogue.job_changes, JobView.of)]
-    return Lookout(DEFAULT_OWNER, kinds, catalogue.census.clock, let_in)
+def lookout_of(
+    catalogue: Catalogue, kind: str = "job", let_in: Callable[[Any], bool] = lambda _: True
+) -> Lookout:
+    """For the jobs or the bulk runs of the owner."""
+    jobs = Kind("job", catalogue.job_changes, JobView.of)
+    bulks = Kind("bulk", catalogue.bulk_changes, BulkLine.model_validate)
+    return Lookout(DEFAULT_OWNER, [jobs if kind == "job" else bulks], catalogue.census.clock, let_in)
 
 
 def follower_of(*named: str, kind: str = "job", since: float | None = None) -> OwnerFollower:
-    """A stream of all jobs of the owner."""
+    """A stream of all jobs or bulk runs of the owner."""
     after = None if since is None else [(since, "")]
     return OwnerFollower(CALLER, [(kind, one) for one in named], after)
 
@@ -163,8 +157,11 @@ def follower_of(*named: str, kind: str = "job", since: float | None = None) -> O
 class Looks:
     """The news of one look after the other, as (name of the event, data)."""
 
-    def __init__(self, catalogue: Catalogue, *named: str, since: float | None = None) -> None:
-        self.lookout, self.follower = lookout_of(catalogue), follower_of(*named, since=since)
+    def __init__(
+        self, catalogue: Catalogue, *named: str, kind: str = "job", since: float | None = None
+    ) -> None:
+        self.lookout = lookout_of(catalogue, kind)
+        self.follower = follower_of(*named, kind=kind, since=since)
 
     def told(self) -> list[tuple[str, dict[str, Any]]]:
         text, _ = self.lookout.look_for(self.follower)
@@ -172,15 +169,6 @@ class Looks:
 
     def phases(self) -> list[tuple[str, str]]:
         return [(data["id"], data.get("phase", name)) for name, data in self.told()]
-
-
-class BulkLooks(Looks):
-    """The same for bulk runs."""
-
-    def __init__(self, catalogue: Catalogue, *named: str) -> None:
-        kinds = [Kind("bulk", catalogue.bulk_changes, Line.of)]
-        self.lookout = Lookout(DEFAULT_OWNER, kinds, catalogue.census.clock, lambda _: True)
-        self.follower = follower_of(*named, kind="bulk")
 
 
 def _parsed(text: str) -> tuple[str, dict[str, Any]]:
@@ -260,7 +248,7 @@ def test_a_bulk_run_that_ended_some_time_ago_is_followed_until_it_is_deleted(
     before = bulk_run(catalogue)
     catalogue.bulks.cancel(before)
     time.sleep(0.01)
-    looks = BulkLooks(catalogue)
+    looks = Looks(catalogue, kind="bulk")
     looks.told()
     for run in runs:
         catalogue.bulks.cancel(run)
@@ -272,7 +260,7 @@ def test_a_bulk_run_that_ended_some_time_ago_is_followed_until_it_is_deleted(
         assert catalogue.bulks.delete(run)
     assert sorted(looks.phases()) == sorted((run, "gone") for run in runs[1:])
     assert looks.told() == []
-    assert BulkLooks(catalogue, before).phases() == [(before, "gone")], "as a name that nothing has"
+    assert Looks(catalogue, before, kind="bulk").phases() == [(before, "gone")], "as a name that nothing has"
 
 
 def test_other_owners_and_turns_of_bulk_runs_are_not_told(catalogue: Catalogue) -> None:
@@ -350,7 +338,7 @@ def test_all_streams_of_an_owner_need_as_few_queries_as_one(
             statements.append(statement)
 
     async def queries(many: int) -> int:
-        seen = lookout_of(catalogue, lambda caller: catalogue.keys.is_good(caller.name) or True)
+        seen = lookout_of(catalogue, let_in=lambda caller: catalogue.keys.is_good(caller.name) or True)
         followers: list[Follower] = [follower_of() for _ in range(many)]
         followers += [Follower(CALLER, {("job", one): ""}) for one in ids[:many]]
         assert all([(await seen.next(one))[0] for one in followers])
