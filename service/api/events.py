@@ -2,19 +2,14 @@
 all jobs and bulk runs of an owner, ``/v1/events``.
 
 The streams of an owner read the database together every ``LOOK_EVERY_S`` seconds (``service.http.lookout``), so any server
-can send them.
+can send them. They ask what changed since the last look; the number of queries does not depend on the number of jobs.
 
-The stream of one job or bulk run reads its row. The id of an event is a hash of the row's state. If a client reconnects
-with the id of its last event (``Last-Event-ID``), it gets an event at once only if the state has changed in the
-meantime.
+In the stream of one job or bulk run, the id of an event is the version of its row. If a client reconnects with the id of its
+last event (``Last-Event-ID``), it gets an event at once only if the row has changed in the meantime.
 
 Browsers open at most six connections to a server over HTTP/1.1. A page with one stream for each job would use all six.
-Therefore one stream sends all jobs of an owner; its number of queries does not depend on the number of jobs. The stream
-remembers the last state of each open job (a job that has not ended), and sends the jobs whose state has changed. A
-remembered job that is no longer open has ended or was deleted; the stream reads it by its id, without comparing times.
-A job that ended before the stream first read it is found by the time of its end. Bulk runs can be deleted after their
-end: the stream also reads the ended runs that it has sent, and reports the deleted runs. The id of an event is a time
-(database clock): a client that reconnects with this id gets the jobs that ended after this time.
+Therefore one stream sends all jobs and bulk runs of an owner. The id of an event is a time (database clock): a client that
+reconnects with this id gets what changed after this time. Deletions are found among the rows that the stream has sent.
 """
 
 from __future__ import annotations
@@ -35,11 +30,11 @@ from service.api.bulk import find as find_bulk
 from service.api.jobs import JobId
 from service.api.jobs import find as find_job
 from service.http.callers import Caller, Reading, still_let_in
-from service.http.lookout import OVERLAP_S, Follower, Lookout, OwnerFollower, RowFollower, Watch
+from service.http.lookout import Follower, Key, Kind, Lookout, OwnerFollower, version
 from service.http.problems import RESPONSES
 from service.http.state import Shared
 from service.views import JobView
-from workers.catalogue.followed import MOST, Place
+from workers.catalogue.tables import BulkRow, JobRow
 
 ALIVE_EVERY_S = 15.0
 COME_BACK_MS = 2000
@@ -50,14 +45,14 @@ router = APIRouter(tags=["events"], responses=RESPONSES)
 LastId = Annotated[str | None, Header(alias="Last-Event-ID", max_length=64)]
 Id = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{32}$")]
 Moment = Annotated[str | None, Header(alias="Last-Event-ID", pattern=r"^[0-9]{1,12}\.[0-9]{3}$")]
-DESCRIBED: dict[int | str, dict[str, Any]] = {
+STREAM: dict[int | str, dict[str, Any]] = {
     200: {
         "description": "Events `progress`. The data of each event is the complete job or bulk run. The last event is `end`.",
         "content": {TYPE: {}},
     },
     204: {"description": "The last event that the client received was `end`; no more events follow."},
 }
-DESCRIBED_OF_OWNER: dict[int | str, dict[str, Any]] = {
+STREAM_OF_OWNER: dict[int | str, dict[str, Any]] = {
     200: {
         "description": "Events `job` and `bulk` are sent for new and changed jobs and bulk runs; the data is the complete job "
         'or bulk run. Events `gone` are sent for deleted ones; the data is {"kind": "job" or "bulk", "id": ...}. '
@@ -71,35 +66,37 @@ DESCRIBED_OF_OWNER: dict[int | str, dict[str, Any]] = {
     "/v1/jobs/{job_id}/events",
     summary="The progress of a job as events",
     response_class=Response,
-    responses=DESCRIBED,
+    responses=STREAM,
 )
 async def follow_job(
     job_id: JobId, request: Request, caller: Reading, state: Shared, last_id: LastId = None
 ) -> Response:
     """Send the job now and after every change, until the job ends."""
     row = await run_in_threadpool(find_job, state, caller, job_id)
-    follower = RowFollower(caller, state.catalogue.followed_jobs, job_id, JobView.of, last_id)
-    return _ended() if follower.knows_end(row) else _stream(request, state, caller, follower)
+    return _stream_of(row, ("job", job_id), request, state, caller, last_id)
 
 
 @router.get(
     "/v1/bulk/{bulk_id}/events",
     summary="The progress of a bulk run as events",
     response_class=Response,
-    responses=DESCRIBED,
+    responses=STREAM,
 )
 async def follow_bulk(
     bulk_id: BulkId, request: Request, caller: Reading, state: Shared, last_id: LastId = None
 ) -> Response:
     """Send the bulk run now and after every change, until the run ends. The stream of a paused run stays open."""
     row = await run_in_threadpool(find_bulk, state, caller, bulk_id)
-    view = partial(BulkView.of, state=state)
-    follower = RowFollower(caller, state.catalogue.followed_bulks, bulk_id, view, last_id)
-    return _ended() if follower.knows_end(row) else _stream(request, state, caller, follower)
+    return _stream_of(row, ("bulk", bulk_id), request, state, caller, last_id)
 
 
-def _ended() -> Response:
-    return Response(status_code=204)  # it tells a browser not to reconnect
+def _stream_of(
+    row: JobRow | BulkRow, key: Key, request: Request, state: Shared, caller: Caller, last_id: str | None
+) -> Response:
+    """The stream of one job or bulk run."""
+    if row.ended_at is not None and version(row.changed_at) == last_id:
+        return Response(status_code=204)  # the client has the last event; it tells a browser not to reconnect
+    return _stream(request, state, caller, Follower(caller, {key: last_id or ""}))
 
 
 def _stream(request: Request, state: Shared, caller: Caller, follower: Follower) -> Response:
@@ -110,7 +107,13 @@ def _stream(request: Request, state: Shared, caller: Caller, follower: Follower)
     """
     state.streams.open(caller.account)
     ends_at = time.monotonic() + state.settings.stream_s
-    lookout = state.lookouts.setdefault(caller.owner, Lookout(partial(still_let_in, state)))
+    catalogue = state.catalogue
+    kinds: list[Kind[Any]] = [
+        Kind("job", catalogue.job_changes, JobView.of),
+        Kind("bulk", catalogue.bulk_changes, partial(BulkView.of, state=state)),
+    ]
+    lookout = Lookout(caller.owner, kinds, catalogue.census.clock, partial(still_let_in, state))
+    lookout = state.lookouts.setdefault(caller.owner, lookout)
 
     async def texts() -> AsyncIterator[str]:
         yield f"retry: {COME_BACK_MS}\n\n"
@@ -150,7 +153,7 @@ class _Stream(StreamingResponse):
     "/v1/events",
     summary="The progress of all your jobs and bulk runs as events",
     response_class=Response,
-    responses=DESCRIBED_OF_OWNER,
+    responses=STREAM_OF_OWNER,
 )
 async def follow_all(
     request: Request,
@@ -175,22 +178,6 @@ async def follow_all(
     get some of these jobs and bulk runs twice. If an owner has very many waiting jobs, only the newest are sent at
     first; each of the others is sent when it starts. The turns of bulk runs, which are jobs too, are not sent.
     """
-    catalogue, owner = state.catalogue, caller.owner
-    since = Place(
-        float(last_id)
-        if last_id is not None
-        else await run_in_threadpool(catalogue.followed_jobs.now) - OVERLAP_S
-    )
-    watches: list[Watch[Any]] = [
-        Watch("job", catalogue.followed_jobs, JobView.of, owner, frozenset(job or ()), since),
-        Watch(
-            "bulk",
-            catalogue.followed_bulks,
-            partial(BulkView.of, state=state),
-            owner,
-            frozenset(bulk or ()),
-            since,
-            after_end=MOST,
-        ),
-    ]
-    return _stream(request, state, caller, OwnerFollower(caller, watches))
+    named = [("job", one) for one in job or ()] + [("bulk", one) for one in bulk or ()]
+    after = None if last_id is None else [(float(last_id), "")] * 2  # jobs and bulk runs
+    return _stream(request, state, caller, OwnerFollower(caller, named, after))

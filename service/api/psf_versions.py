@@ -16,12 +16,11 @@ from service.http.problems import RESPONSES, as_problems
 from service.http.state import Shared, State
 from service.views import PastChange, RowView, was_certified
 from workers.catalogue.affected import Affected, Place
-from workers.catalogue.contexts import NAME, Pin
-from workers.catalogue.psfs import StatusAsked
+from workers.catalogue.contexts import NAME
 from workers.catalogue.tables import PsfContextRow, PsfRow
+from workers.contract.psf_status import Pin, Reason, StatusChange
 from workers.contract.requests import ContextName, Identity
-from workers.texts import Lines
-from workers.versions import MAY_BECOME, TIME, WORD, PsfStatus, Validity, iso, next_version
+from workers.versions import MAY_BECOME, WORD, PsfStatus, iso, next_version
 
 log = logging.getLogger(__name__)
 router = APIRouter(prefix="/v1/psfs", tags=["PSFs"], responses=RESPONSES, route_class=KeyFirst)
@@ -29,13 +28,8 @@ series = APIRouter(prefix="/v1/series", tags=["PSFs"], responses=RESPONSES, rout
 contexts = APIRouter(prefix="/v1/contexts", tags=["contexts"], responses=RESPONSES, route_class=KeyFirst)
 affected = APIRouter(tags=["PSFs"], responses=RESPONSES)
 
-Time = Annotated[
-    str, Field(pattern=TIME, description="such as 2024-03-01T12:00:00Z; a time without a zone is UTC")
-]
 # A time of the catalogue, seconds since 1970, as ISO 8601; null for none and for an open end.
 ShownTime = Annotated[str | None, BeforeValidator(lambda at: iso(at) if isinstance(at, float) else at)]
-Reason = Annotated[Lines, Field(max_length=400, description="the reason, stored for later readers")]
-Word = Annotated[str, Field(pattern=WORD)]
 Instrument = Annotated[str, Path(pattern=WORD, description="such as `hri_euv`")]
 Channel = Annotated[
     str,
@@ -47,40 +41,6 @@ Kind = Annotated[str, Path(pattern=WORD, description="such as `total`")]
 IdOrName = Annotated[
     str, Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$", description="id or name of the context")
 ]
-
-
-class StatusChange(BaseModel):
-    """A change of a PSF's status: certify a draft, change the range of a certified PSF, or deprecate a certified
-    PSF."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    status: PsfStatus
-    reason: Reason = ""
-    version: str | None = Field(
-        None,
-        max_length=40,
-        description="for a draft: a version of three numbers such as 1.2.0, which the series does not have yet",
-    )
-    valid_from: Time | None = Field(
-        None, description="start of the range of observation times; null: no lower limit"
-    )
-    valid_to: Time | None = Field(None, description="end of the range, excluded; null: no upper limit")
-    supersedes: list[Identity] = Field(
-        [],
-        max_length=100,
-        description="ids of certified PSFs of the series that are deprecated in the same step",
-    )
-    successor: Identity | None = Field(
-        None, description="for a deprecated PSF: id of the certified PSF to use instead"
-    )
-    instrument: Word | None = Field(None, description="for a draft whose file names no instrument")
-    channel: Word | None = Field(
-        None,
-        description="for a draft whose file names no wavelength; or a variant of its channel for one filter (card FILTER) or plate "
-        "scale, such as `174-open_2` or `174-0.984arcsec`",
-    )
-    kind: Word | None = Field(None, description="for an uploaded draft, such as `total`")
 
 
 class Change(PastChange):
@@ -130,25 +90,9 @@ def change_psf_status(psf_id: Identity, body: StatusChange, caller: Certifying, 
     of another certified PSF, the answer is 409; the message names this PSF.
     """
     with as_problems():
-        row = state.catalogue.psfs.change(psf_id, caller.owner, _asked(body), caller.name)
+        row = state.catalogue.psfs.change(psf_id, caller.owner, body, caller.name)
     log.info("PSF %s: %s, version %s, by %s", row.id, row.status, row.version, caller.name)
     return _view(state, caller, row)
-
-
-def _asked(body: StatusChange) -> StatusAsked:
-    values = body.model_dump(exclude={"valid_from", "valid_to", "successor", "supersedes"})
-    return StatusAsked(
-        validity=_range(body),
-        successor_id=body.successor,
-        supersedes=tuple(body.supersedes),
-        **values,
-    )
-
-
-def _range(body: StatusChange | PinAsked) -> Validity | None:
-    """The range of observation times in a request; None if the request names neither of its ends."""
-    named = {"valid_from", "valid_to"} & body.model_fields_set
-    return Validity.of(body.valid_from, body.valid_to) if named else None
 
 
 def _view(state: State, caller: Caller, row: PsfRow) -> StatusView:
@@ -305,24 +249,14 @@ def _place(one: Affected) -> tuple[str, ...]:
 # --- contexts -------------------------------------------------------------------------------------------
 
 
-class PinAsked(BaseModel):
-    """A PSF to pin. The default of its time range is the validity of the PSF."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    psf_id: Identity
-    valid_from: Time | None = None
-    valid_to: Time | None = None
-
-
-class ContextAsked(BaseModel):
+class NewContext(BaseModel):
     """A context to create: it pins the given PSFs, or all PSFs that are certified now."""
 
     model_config = ConfigDict(extra="forbid")
 
     name: str = Field(pattern=NAME, description="any name except `now` and `default`")
     reason: Reason = ""
-    pins: list[PinAsked] | None = Field(
+    pins: list[Pin] | None = Field(
         None, max_length=10_000, description="null: all PSFs that are certified now"
     )
 
@@ -364,7 +298,7 @@ class WholeContext(ContextView):
     pins: list[PinView] = Field(description="PSFs of the context, sorted by series and time")
 
 
-class DefaultAsked(BaseModel):
+class DefaultContext(BaseModel):
     """The new default context, from which the PSF for an image is chosen."""
 
     model_config = ConfigDict(extra="forbid")
@@ -396,12 +330,11 @@ class DefaultView(BaseModel):
     summary="Create a context",
     responses={200: {"model": WholeContext, "description": "The same context already exists."}},
 )
-def create_context(body: ContextAsked, response: Response, caller: Certifying, state: Shared) -> WholeContext:
+def create_context(body: NewContext, response: Response, caller: Certifying, state: Shared) -> WholeContext:
     """Pin PSFs under a name: the given PSFs, or all PSFs that are certified now."""
     with as_problems():
-        pins = None if body.pins is None else [Pin(pin.psf_id, _range(pin)) for pin in body.pins]
         row, new = state.catalogue.contexts.create(
-            body.name, caller.owner, caller.name, reason=body.reason, pins=pins
+            body.name, caller.owner, caller.name, reason=body.reason, pins=body.pins
         )
     response.status_code = 201 if new else 200
     response.headers["Location"] = f"/v1/contexts/{row.id}"
@@ -428,7 +361,7 @@ def get_default_context(caller: Reading, state: Shared) -> DefaultView:
 
 
 @contexts.put("/default", summary="Change the default context")
-def move_default_context(body: DefaultAsked, caller: Certifying, state: Shared) -> DefaultView:
+def move_default_context(body: DefaultContext, caller: Certifying, state: Shared) -> DefaultView:
     """Set the default context. If `context` is null, there is no default. The history of changes is kept."""
     with as_problems():
         state.catalogue.contexts.set_default(body.context, caller.owner, caller.name, body.reason)

@@ -24,7 +24,7 @@ from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import ImageRow, PsfRow
 from workers.contract.requests import Identity
 from workers.files.collection import remove_unnamed
-from workers.intake.psf_choice import MOST_NAMED, Found, look, look_for_image
+from workers.intake.psf_choice import MOST_NAMED, SearchResult, look, look_for_image
 from workers.texts import Name
 from workers.versions import TIME, TOTAL, WORD, PsfStatus, iso, seconds
 
@@ -130,7 +130,7 @@ def get_psf_for_image(
     return _choice(lambda: look_for_image(state.catalogue, row.summary, caller.owner, context, kind))
 
 
-def _choice(search: Callable[[], Found]) -> Choice:
+def _choice(search: Callable[[], SearchResult]) -> Choice:
     candidates: list[dict[str, str | None]] = []
     try:
         found = search()

@@ -211,7 +211,7 @@ class Kind(Generic[Row]):
             return self.content(path, state)
 
 
-class Received:
+class RequestFile:
     """A file of a request, which is written to a temporary path and hashed while it arrives.
 
     filename: the name that the client gives to the file. bytes: the number of bytes that have arrived.
@@ -322,7 +322,7 @@ def _advising(request: Request) -> Iterator[None]:
         raise Problem(error.status, error.code, f"{error.detail}; {advice}", **error.more) from error
 
 
-async def _receive(request: Request, path: Path, state: State, kind: Kind[Any], take: Allowed) -> Received:
+async def _receive(request: Request, path: Path, state: State, kind: Kind[Any], take: Allowed) -> RequestFile:
     """Write the file of a request to a path."""
     most_bytes = kind.most_bytes(state)
     text = request.headers.get("content-length", "")
@@ -332,7 +332,7 @@ async def _receive(request: Request, path: Path, state: State, kind: Kind[Any], 
     if counted:  # if the length is declared, the upload can be refused before it is sent
         await run_in_threadpool(take, counted)
     start = b""
-    with Received(path) as file:
+    with RequestFile(path) as file:
         async for name, chunk in _file_of(request, most_bytes):
             file.filename = name
             if len(start) < kind.start_bytes:

@@ -20,7 +20,6 @@ from service.api.psf_curves import tables_of
 from service.api.psf_versions import (
     SeriesChange,
     SeriesView,
-    StatusChange,
     change_psf_status,
     change_series,
     get_psf_status,
@@ -51,6 +50,7 @@ from service.views import PsfView
 from workers.catalogue.access import Scope
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import PsfRow, ReportRow
+from workers.contract.psf_status import StatusChange
 from workers.contract.requests import Component, Identity, PsfBuild
 from workers.versions import TOTAL, PsfStatus, without_variant
 

@@ -23,7 +23,7 @@ from pydantic_core import ErrorDetails, from_json
 
 from psfcore.errors import DataError
 from service.http.callers import Caller, Submitting
-from service.http.files import IMAGE, PSF, TRANSIT, Kind, Received, label
+from service.http.files import IMAGE, PSF, TRANSIT, Kind, RequestFile, label
 from service.http.forms import FORM, FormPart, Piece, media_type_of
 from service.http.problems import Problem
 from service.http.quotas import Allowed, check_room
@@ -144,7 +144,7 @@ class Sent:
 
     fields: dict[str, str]
     uploads: tuple[str, ...] = ()
-    parts: Mapping[str, Received] = field(default_factory=dict)
+    parts: Mapping[str, RequestFile] = field(default_factory=dict)
 
 
 async def _sent(request: Request, caller: Submitting, state: Shared) -> AsyncIterator[Sent]:
@@ -166,7 +166,7 @@ async def _sent(request: Request, caller: Submitting, state: Shared) -> AsyncIte
 SentForm = Annotated[Sent, Depends(_sent)]
 
 
-def files_of(sent: Sent, kind: str) -> dict[str, Received]:
+def files_of(sent: Sent, kind: str) -> dict[str, RequestFile]:
     """The file for each name in UPLOAD.
 
     Raises ``Problem`` if UPLOAD is malformed, names a part that the form does not have, or sets a parameter twice; if
@@ -204,12 +204,12 @@ def files_of(sent: Sent, kind: str) -> dict[str, Received]:
     return {name: sent.parts[part] for name, part in parts.items()}
 
 
-def ids_of(files: Mapping[str, Received]) -> dict[str, str]:
+def ids_of(files: Mapping[str, RequestFile]) -> dict[str, str]:
     """The parameters that the files of a form set: the id of each file, by the name of the parameter."""
     return {NAMES[name]: file.sha256 for name, file in files.items()}
 
 
-def keep(state: State, caller: Caller, files: Mapping[str, Received]) -> None:
+def keep(state: State, caller: Caller, files: Mapping[str, RequestFile]) -> None:
     """Check the files of a form, and add them to the catalogue. If one of them is refused, none is added.
 
     Raises ``Problem`` 413, 415 or 422 if a file cannot be used.
@@ -234,8 +234,8 @@ class _Files:
     def __init__(self, store: Store, take: Callable[[int], None], resources: ExitStack) -> None:
         self._store, self._take, self._resources = store, take, resources
         self._uncounted = 0
-        self._open: dict[FormPart, Received] = {}
-        self.parts: dict[str, Received] = {}
+        self._open: dict[FormPart, RequestFile] = {}
+        self.parts: dict[str, RequestFile] = {}
 
     def write(self, pieces: list[Piece]) -> None:
         """Write the bytes of files that have arrived."""
@@ -252,5 +252,5 @@ class _Files:
         if sent.name in self.parts or len(self.parts) == MOST_FILES:
             raise bad(f"expected at most {MOST_FILES} files in parts of different names; got more")
         path = self._resources.enter_context(self._store.temporary())
-        file = self._resources.enter_context(Received(path, sent.filename))
+        file = self._resources.enter_context(RequestFile(path, sent.filename))
         self._open[sent] = self.parts[sent.name] = file

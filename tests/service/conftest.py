@@ -24,10 +24,9 @@ from tests.transit_files import write_transit
 from tests.workers.jobs import run_job
 from workers.bulk.runs import keep_turns
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.contexts import Pin
-from workers.catalogue.psfs import StatusAsked
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow, ProductRow, PsfRow, ReportRow
 from workers.contract.jobs import Phase
+from workers.contract.psf_status import Pin, StatusChange
 from workers.files.store import Store
 from workers.run.runner import Runner
 from workers.settings import Settings
@@ -202,9 +201,9 @@ def one_of_everything(service: Keyed, folder: Path) -> dict[str, str]:
     catalogue.add(ProductRow(**about, **made, id="1" * 64, kind="x"))
     catalogue.add(ReportRow(**about, id="2" * 64, kind="x", transit_id="3" * 64))
     catalogue.add(PsfRow(**about, **series, id="4" * 64, name="s3cret", version="1"))
-    certified = StatusAsked(PsfStatus.CERTIFIED, "good", "1.0.0", channel="174")
+    certified = StatusChange(status=PsfStatus.CERTIFIED, reason="good", version="1.0.0", channel="174")
     catalogue.psfs.change("4" * 64, "ann", certified, "ann")
-    context, _ = catalogue.contexts.create("s3cret", "ann", "ann", pins=[Pin("4" * 64)])
+    context, _ = catalogue.contexts.create("s3cret", "ann", "ann", pins=[Pin(psf_id="4" * 64)])
     bulk = ann.post("/v1/bulk", json={"images": [image_id], "psf_id": psf_id})
     tus = {"Tus-Resumable": "1.0.0", "Upload-Length": "10", "Upload-Metadata": "kind dHJhbnNpdA=="}
     open_upload = ann.post("/v1/uploads", headers=tus).headers["location"]

@@ -11,9 +11,9 @@ import pytest
 
 from psfcore.errors import DataError
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.psfs import StatusAsked
 from workers.catalogue.tables import ProductRow, PsfRow
-from workers.versions import PsfStatus, Validity, series_of
+from workers.contract.psf_status import Pin, StatusChange
+from workers.versions import PsfStatus, Validity, iso, series_of
 
 OWNER = "local"
 ALWAYS = Validity()
@@ -79,16 +79,27 @@ def certify(
     catalogue: Catalogue, name: str, version: str, validity: Validity | None = None, **asked: Any
 ) -> PsfRow:
     """Certify the PSF of this name."""
-    wanted = StatusAsked(PsfStatus.CERTIFIED, "tested", version=version, validity=validity, **asked)
-    return catalogue.psfs.change(identity(name), OWNER, wanted, "tester")
+    change = StatusChange(
+        status=PsfStatus.CERTIFIED, reason="tested", version=version, **between(validity), **asked
+    )
+    return catalogue.psfs.change(identity(name), OWNER, change, "tester")
 
 
 def deprecate(catalogue: Catalogue, name: str, successor: str | None = None) -> PsfRow:
     """Deprecate the PSF of this name."""
-    wanted = StatusAsked(
-        PsfStatus.DEPRECATED, "worse", successor_id=None if successor is None else identity(successor)
-    )
-    return catalogue.psfs.change(identity(name), OWNER, wanted, "tester")
+    named = None if successor is None else identity(successor)
+    change = StatusChange(status=PsfStatus.DEPRECATED, reason="worse", successor=named)
+    return catalogue.psfs.change(identity(name), OWNER, change, "tester")
+
+
+def pin(name: str, validity: Validity | None = None) -> Pin:
+    """The PSF of this name, for a range of times."""
+    return Pin(psf_id=identity(name), **between(validity))
+
+
+def between(validity: Validity | None) -> dict[str, Any]:
+    """A range as a client sends it."""
+    return {} if validity is None else {"valid_from": iso(validity.start), "valid_to": iso(validity.end)}
 
 
 def years(start: int | None, end: int | None) -> Validity:

@@ -35,7 +35,7 @@ ADD_EVERY_S = (
 
 @dataclass(frozen=True)
 class Place:
-    """How far the search for the files of a run has come. pattern: number of the pattern. names: see ``archive.Looked``."""
+    """How far the search for the files of a run has come. pattern: number of the pattern. names: see ``archive.Entry``."""
 
     pattern: int
     names: archive_files.Place
@@ -159,7 +159,7 @@ def found_files(
 
 
 def _listed_one(
-    allowed: Sequence[Path], limits: FitsLimits, entry: archive_files.Looked, where: dict[str, Condition]
+    allowed: Sequence[Path], limits: FitsLimits, entry: archive_files.Entry, where: dict[str, Condition]
 ) -> Listed | None:
     """An entry of a folder as an image of the run, with an error if the file cannot be used; None if its header does not match."""
     failure = entry.error

@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 from sqlalchemy import Select, String, cast, create_engine, false, select, update
 from sqlalchemy.exc import DatabaseError, IntegrityError
 from sqlalchemy.orm import Session
+from sqlalchemy.orm.attributes import flag_modified
 from sqlalchemy.pool import NullPool
 
 from psfcore.errors import DataError
@@ -21,9 +22,9 @@ from workers.catalogue.access import Keys, Sessions
 from workers.catalogue.affected import AffectedProducts
 from workers.catalogue.bulks import Bulks
 from workers.catalogue.census import Census, KeptStageTimes
+from workers.catalogue.changes import changes_of_bulks, changes_of_jobs
 from workers.catalogue.contexts import Contexts, Series
 from workers.catalogue.database import Database, begins_with, newest_first
-from workers.catalogue.followed import followed_bulks, followed_jobs
 from workers.catalogue.jobs import Jobs, Parts
 from workers.catalogue.owners import NamedFiles, Owners, hold_to_quota, lock_owner
 from workers.catalogue.psfs import Psfs, existing_psf
@@ -41,8 +42,8 @@ from workers.catalogue.tables import (
     TransitRow,
     WorkerRow,
 )
+from workers.catalogue.turns import Places, Turns
 from workers.catalogue.uws_jobs import UwsJobs
-from workers.catalogue.waiting import Places, Turns
 from workers.contract.bulk import OPEN
 from workers.contract.identities import canonical_hash
 from workers.contract.jobs import ENDED, Phase
@@ -72,8 +73,8 @@ class Catalogue:
         self.uws = UwsJobs(self._database, self.jobs)
         self.parts = Parts(self._database)
         self.bulks = Bulks(self._database)
-        self.followed_jobs = followed_jobs(self._database)
-        self.followed_bulks = followed_bulks(self._database)
+        self.job_changes = changes_of_jobs(self._database)
+        self.bulk_changes = changes_of_bulks(self._database)
         self.psfs = Psfs(self._database)
         self.contexts = Contexts(self._database)
         self.series = Series(self._database)
@@ -244,6 +245,7 @@ def _unshare_jobs(session: Session, owner: str, result_id: str) -> None:
     )
     for job in session.scalars(done):
         job.request_key = canonical_hash({"request_key": job.request_key, "deleted": job.id})
+        flag_modified(job, "changed_at")  # it is written as it is, because no event tells of this change
 
 
 def _check_unused(session: Session, psf: PsfRow) -> None:

@@ -30,6 +30,7 @@ from workers.catalogue.tables import (
     SeriesChangeRow,
 )
 from workers.contract.identities import canonical_hash
+from workers.contract.psf_status import Pin
 from workers.contract.requests import SHORT_ID
 from workers.versions import SEPARATOR, TOTAL, PsfStatus, Validity, iso
 
@@ -165,14 +166,6 @@ def _check_known(session: Session, series: str, owner: str) -> None:
 
 
 # Contexts -------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Pin:
-    """A PSF for a range of observation times. validity: this range; None: the range for which the PSF is certified."""
-
-    psf_id: str
-    validity: Validity | None = None
 
 
 class Contexts(Queries):

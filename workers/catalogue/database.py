@@ -19,7 +19,6 @@ from sqlalchemy import (
     and_,
     create_engine,
     event,
-    literal_column,
     select,
     tuple_,
 )
@@ -27,6 +26,7 @@ from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import CursorResult
 from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
+from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.orm import InstrumentedAttribute, Session, sessionmaker
 
 from psfcore.errors import DataError
@@ -41,8 +41,34 @@ Value = TypeVar("Value")
 Query = TypeVar("Query", bound=Select[*tuple[Any, ...]])
 
 
+class Now(ColumnElement[float]):
+    """The time of the database's clock, in seconds since 1970. All machines share this clock.
+
+    The value is the time at which the SQL statement began. On SQLite it is rounded to milliseconds.
+    """
+
+    inherit_cache = True
+    type = Double()
+
+
+@compiles(Now)
+def _now(*_: Any, **__: Any) -> str:
+    # PostgreSQL can use an index with this clock, because it is constant within a statement.
+    return "CAST(extract(epoch FROM statement_timestamp()) AS double precision)"
+
+
+@compiles(Now, "sqlite")
+def _now_of_sqlite(*_: Any, **__: Any) -> str:
+    return "((julianday('now') - 2440587.5) * 86400.0)"
+
+
 class Database:
-    """An engine and its sessions. ``writing`` takes SQLite's write lock at the start; ``reading`` takes no lock."""
+    """An engine and its sessions. ``writing`` takes SQLite's write lock at the start; ``reading`` takes no lock.
+
+    now: the time of the database's clock, as an SQL expression.
+    """
+
+    now = Now()
 
     def __init__(self, url: str) -> None:
         self.engine = open_engine(url)
@@ -61,20 +87,6 @@ class Database:
         """The file of an SQLite database; None if the database has no file."""
         name = self.engine.url.database
         return Path(name) if self.sqlite and name and name != ":memory:" else None
-
-    @property
-    def now(self) -> ColumnElement[float]:
-        """An SQL expression for the time of the database's clock, in seconds since 1970. All machines share this clock.
-
-        The value is the time at which the SQL statement began. On SQLite it is rounded to milliseconds.
-        """
-        # PostgreSQL can use an index with this clock, because it is constant within a statement.
-        now = (
-            "(julianday('now') - 2440587.5) * 86400.0"
-            if self.sqlite
-            else "CAST(extract(epoch FROM statement_timestamp()) AS double precision)"
-        )
-        return literal_column(f"({now})", Double)
 
     def clock(self) -> float:
         """The time of the database's clock, in seconds since 1970."""

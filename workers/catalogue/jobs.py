@@ -119,11 +119,11 @@ class Jobs(Queries):
     def mark_submitted(self, *job_ids: str) -> None:
         """Record that the broker has received the jobs' ids."""
         counted = {"submissions": JobRow.submissions + 1, "delayed": False}
-        self._set([JobRow.id.in_(job_ids)], submitted_at=self._database.now, **counted)
+        self._note([JobRow.id.in_(job_ids)], submitted_at=self._database.now, **counted)
 
     def forget_submission(self, job_id: str) -> None:
         """Record that a worker took the message of a queued job from the broker, but did not claim the job."""
-        self._set([JobRow.id == job_id, JobRow.phase == Phase.QUEUED], submitted_at=None)
+        self._note([JobRow.id == job_id, JobRow.phase == Phase.QUEUED], submitted_at=None)
 
     def claim(self, job_id: str, worker: str) -> Lease | None:
         """Give a queued job to a worker. If several workers try, exactly one gets the lease; the others get None.
@@ -173,7 +173,9 @@ class Jobs(Queries):
 
     def heartbeat(self, lease: Lease) -> bool:
         """Record that the worker is alive. Returns False if the lease is lost or the job was cancelled."""
-        return self._set([*_held(lease), JobRow.cancel_requested.is_(False)], heartbeat_at=self._database.now)
+        return self._note(
+            [*_held(lease), JobRow.cancel_requested.is_(False)], heartbeat_at=self._database.now
+        )
 
     def progress(self, lease: Lease, stage: str, step: int, steps: int) -> bool:
         """Store the job's progress and a heartbeat. Returns False if the lease is lost or the job was cancelled.
@@ -249,7 +251,7 @@ class Jobs(Queries):
         now = self._database.now
         ahead = [JobRow.phase == Phase.EXECUTING, JobRow.heartbeat_at > now + lease_s]
         started_at = case((JobRow.started_at > now, now), else_=JobRow.started_at)
-        self._set(ahead, heartbeat_at=now, started_at=started_at)
+        self._note(ahead, heartbeat_at=now, started_at=started_at)
         silent = [JobRow.phase == Phase.EXECUTING, JobRow.heartbeat_at < self._database.now - lease_s]
         too_often = and_(JobRow.cancel_requested.is_(False), JobRow.attempt >= max_attempts)
         error = JobError(
@@ -364,6 +366,10 @@ class Jobs(Queries):
             "ended_at": case((cancelled, self._database.now)),
             "lease": None,
         }
+
+    def _note(self, conditions: Sequence[Any], **values: Any) -> bool:
+        """The same as ``_set`` for a change that streams of events do not report."""
+        return self._set(conditions, changed_at=JobRow.changed_at, **values)
 
     def _set(self, conditions: Sequence[Any], **values: Any) -> bool:
         """Run one UPDATE; returns whether it changed a row."""

@@ -18,6 +18,7 @@ from sqlalchemy.orm import Session
 from psfcore.errors import DataError
 from workers.catalogue.database import Queries, insert_into, newest_first
 from workers.catalogue.tables import PsfChangeRow, PsfPinRow, PsfRow, PsfSeriesRow
+from workers.contract.psf_status import MOST_REASON, StatusChange
 from workers.versions import (
     INTERPOLATED,
     UPLOADED,
@@ -28,24 +29,6 @@ from workers.versions import (
     is_variant_of,
     series_of,
 )
-
-MOST_REASON = 400  # characters of a reason that the database stores
-
-
-@dataclass(frozen=True)
-class StatusAsked:
-    """A requested change of a PSF's status."""
-
-    status: PsfStatus
-    reason: str
-    version: str | None = None
-    validity: Validity | None = None
-    successor_id: str | None = None
-    supersedes: tuple[str, ...] = ()  # certified PSFs of the series to deprecate in the same step
-    # The next three fields are only for a draft whose file does not contain them.
-    instrument: str | None = None
-    channel: str | None = None
-    kind: str | None = None
 
 
 @dataclass(frozen=True)
@@ -112,7 +95,7 @@ class Psfs(Queries):
         """The versions under which PSFs of a series were certified."""
         return self._database.all(_released(series, owner))
 
-    def change(self, psf_id: str, owner: str, asked: StatusAsked, by: str) -> PsfRow:
+    def change(self, psf_id: str, owner: str, change: StatusChange, by: str) -> PsfRow:
         """Change the status of a PSF.
 
         The request certifies a draft, changes the range of a certified PSF, deprecates a certified PSF, or names the
@@ -124,24 +107,24 @@ class Psfs(Queries):
         """
         with self._database.writing.begin() as session:
             row = existing_psf(session, psf_id, owner)
-            series, _ = _series(row, asked)
+            series, _ = _series(row, change)
             # Lock the series until the transaction ends. On SQLite the transaction already holds the write lock.
             line = insert_into(session, PsfSeriesRow).values(owner=owner, series=series)
             session.execute(line.on_conflict_do_nothing())
             session.get(PsfSeriesRow, (owner, series), with_for_update=True)
             row = existing_psf(session, psf_id, owner, lock=True)  # it may have been deleted meanwhile
-            now, columns = _series(row, asked)
+            now, columns = _series(row, change)
             if now != series:
                 raise DataError(
                     "changed-meanwhile",
                     f"another request just put PSF {psf_id} in another series: send this request again",
                 )
             before = PsfStatus(row.status)
-            check_transition(before, asked.status)
-            if asked.status == PsfStatus.CERTIFIED:
-                _certify(session, row, columns, asked, by)
+            check_transition(before, change.status)
+            if change.status == PsfStatus.CERTIFIED:
+                _certify(session, row, columns, change, by)
             else:
-                _deprecate(session, row, asked, by)
+                _deprecate(session, row, change, by)
             return row
 
 
@@ -230,8 +213,8 @@ def existing_psf(session: Session, psf_id: str, owner: str, *, lock: bool = Fals
     return row
 
 
-def _series(row: PsfRow, asked: StatusAsked) -> tuple[str, dict[str, Any]]:
-    """The series of a PSF, completed with ``asked``, and the columns that form its name.
+def _series(row: PsfRow, change: StatusChange) -> tuple[str, dict[str, Any]]:
+    """The series of a PSF, completed by the change, and the columns that form its name.
 
     Raises ``DataError`` "line-known" or "no-line".
     """
@@ -242,7 +225,7 @@ def _series(row: PsfRow, asked: StatusAsked) -> tuple[str, dict[str, Any]]:
         "kind": None if draft and row.kind == UPLOADED else row.kind,
     }
     for name, value in columns.items():
-        new = getattr(asked, name)
+        new = getattr(change, name)
         if new is None or new == value:
             continue
         # The file may name the channel, and the request a variant of it.
@@ -262,19 +245,19 @@ def _series(row: PsfRow, asked: StatusAsked) -> tuple[str, dict[str, Any]]:
     return series, columns | {"kind": kind, "series": series}
 
 
-def _certify(session: Session, row: PsfRow, columns: dict[str, Any], asked: StatusAsked, by: str) -> None:
-    _refuse(asked, "deprecation", successor_id=asked.successor_id)
+def _certify(session: Session, row: PsfRow, columns: dict[str, Any], change: StatusChange, by: str) -> None:
+    _refuse(change, "deprecation", successor=change.successor)
     version, series = row.version, columns["series"]
     if row.status == PsfStatus.DRAFT:
-        version = check_version(asked.version, session.scalars(_released(series, row.owner)))
-    elif asked.version not in (None, row.version):
+        version = check_version(change.version, session.scalars(_released(series, row.owner)))
+    elif change.version not in (None, row.version):
         raise DataError(
             "not-of-this-change",
-            f"expected version {row.version}, because the version of a certified PSF cannot change; got {asked.version}: "
+            f"expected version {row.version}, because the version of a certified PSF cannot change; got {change.version}: "
             "leave it out",
         )
-    validity = asked.validity or validity_of(row)
-    for superseded_id in asked.supersedes:
+    validity = change.validity or validity_of(row)
+    for superseded_id in change.supersedes:
         superseded = session.get(PsfRow, (row.owner, superseded_id), with_for_update=True)
         if (
             superseded is None
@@ -286,8 +269,8 @@ def _certify(session: Session, row: PsfRow, columns: dict[str, Any], asked: Stat
                 "not-to-supersede",
                 f"supersedes: expected certified PSFs of {series}; got {superseded_id}: leave it out",
             )
-        _write(session, superseded, asked.reason, by, status=PsfStatus.DEPRECATED, successor_id=row.id)
-        _deprecate_interpolated(session, superseded, asked.reason, by)
+        _write(session, superseded, change.reason, by, status=PsfStatus.DEPRECATED, successor_id=row.id)
+        _deprecate_interpolated(session, superseded, change.reason, by)
     session.flush()
     other = _overlapping(session, row, series, validity)
     if other is not None:
@@ -299,7 +282,7 @@ def _certify(session: Session, row: PsfRow, columns: dict[str, Any], asked: Stat
         )
     validity_columns = {"valid_from": validity.start, "valid_to": validity.end}
     columns = columns | validity_columns | {"status": PsfStatus.CERTIFIED, "version": version}
-    _write(session, row, asked.reason, by, **columns)
+    _write(session, row, change.reason, by, **columns)
 
 
 def validity_of(row: PsfRow) -> Validity:
@@ -321,27 +304,27 @@ def _overlapping(session: Session, row: PsfRow, series: str, validity: Validity)
     return last if last is not None and validity_of(last).overlaps(validity) else None
 
 
-def _deprecate(session: Session, row: PsfRow, asked: StatusAsked, by: str) -> None:
+def _deprecate(session: Session, row: PsfRow, change: StatusChange, by: str) -> None:
     _refuse(
-        asked,
+        change,
         "certification",
-        version=asked.version,
-        validity=asked.validity,
-        supersedes=asked.supersedes or None,
+        version=change.version,
+        validity=change.validity,
+        supersedes=change.supersedes or None,
     )
-    if row.status == PsfStatus.DEPRECATED and (row.successor_id is not None or asked.successor_id is None):
+    if row.status == PsfStatus.DEPRECATED and (row.successor_id is not None or change.successor is None):
         raise DataError(
             "successor-named",
             f"expected the successor of the deprecated PSF {row.id}; got none: name a certified PSF of its series"
             if row.successor_id is None
             else f"expected a deprecated PSF without a successor; PSF {row.id} has successor {row.successor_id}, which cannot change",
         )
-    if asked.successor_id is not None:
-        successor = session.get(PsfRow, (row.owner, asked.successor_id))
+    if change.successor is not None:
+        successor = session.get(PsfRow, (row.owner, change.successor))
         if successor is None or successor.series != row.series or successor.status != PsfStatus.CERTIFIED:
             raise DataError(
                 "no-such-successor",
-                f"successor: expected a certified PSF of {row.series}; got {asked.successor_id}"
+                f"successor: expected a certified PSF of {row.series}; got {change.successor}"
                 + (
                     ""
                     if successor is None
@@ -351,9 +334,9 @@ def _deprecate(session: Session, row: PsfRow, asked: StatusAsked, by: str) -> No
         if successor is row:
             raise DataError("no-such-successor", f"successor: expected a PSF other than {row.id} itself")
     before = row.status
-    _write(session, row, asked.reason, by, status=PsfStatus.DEPRECATED, successor_id=asked.successor_id)
+    _write(session, row, change.reason, by, status=PsfStatus.DEPRECATED, successor_id=change.successor)
     if before != PsfStatus.DEPRECATED:
-        _deprecate_interpolated(session, row, asked.reason, by)
+        _deprecate_interpolated(session, row, change.reason, by)
 
 
 def _deprecate_interpolated(session: Session, end: PsfRow, reason: str, by: str) -> None:
@@ -374,12 +357,12 @@ def _deprecate_interpolated(session: Session, end: PsfRow, reason: str, by: str)
         _write(session, row, why[:MOST_REASON], by, status=PsfStatus.DEPRECATED)
 
 
-def _refuse(asked: StatusAsked, other: str, **given: object) -> None:
+def _refuse(change: StatusChange, other: str, **given: object) -> None:
     for name, value in given.items():
         if value is not None:
             raise DataError(
                 "not-of-this-change",
-                f"{name}: expected this field only in a {other}; got it with status {asked.status}: leave it out",
+                f"{name}: expected this field only in a {other}; got it with status {change.status}: leave it out",
             )
 
 

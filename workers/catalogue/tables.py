@@ -8,9 +8,21 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import JSON, BigInteger, Double, Index, String, false, text
-from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
+from sqlalchemy import (
+    JSON,
+    BigInteger,
+    ColumnElement,
+    Double,
+    Index,
+    String,
+    case,
+    false,
+    literal_column,
+    text,
+)
+from sqlalchemy.orm import DeclarativeBase, Mapped, MappedColumn, mapped_column
 
+from workers.catalogue.database import Now
 from workers.contract.jobs import LIVE, Queue
 
 DEFAULT_OWNER = "local"
@@ -51,6 +63,16 @@ def _summed(table: str) -> Index:
 def _partial(name: str, condition: Any, *columns: str, unique: bool = False) -> Index:
     """An index of the rows that meet a condition."""
     return Index(name, *columns, unique=unique, sqlite_where=condition, postgresql_where=condition)
+
+
+def _change_time() -> MappedColumn[float]:
+    """The time of the last change that a reader can see, by the database's clock (``workers.catalogue.changes``).
+
+    Each UPDATE sets it, unless the statement gives it a value. It grows even if the clock was set back or did not move.
+    """
+    before: ColumnElement[float] = literal_column("changed_at", Double)
+    later = case((before < Now(), Now()), else_=before + 0.001)
+    return mapped_column(default=Now(), server_default="0", onupdate=later)
 
 
 class Owned:
@@ -255,6 +277,7 @@ class JobRow(Base):
     created_at: Mapped[float] = mapped_column(index=True)
     started_at: Mapped[float | None]
     ended_at: Mapped[float | None]
+    changed_at: Mapped[float] = _change_time()
     submitted_at: Mapped[float | None]
     submissions: Mapped[int] = mapped_column(default=0)
     # A temporary failure ended the last attempt, and the job has not been submitted again yet.
@@ -286,7 +309,7 @@ class JobRow(Base):
         Index("jobs_waiting", "phase", "queue", "created_at", "submitted_at", "owner"),
         _listed("jobs"),
         _listed("jobs", "phase"),
-        Index("jobs_ended", "owner", "ended_at", "id"),
+        Index("jobs_changed", "owner", "changed_at", "id"),
         # This index contains all columns that tally() needs, so that tally() need not read the rows.
         Index("jobs_tallied", "kind", "phase", "attempt", "started_at", "ended_at"),
     )
@@ -320,6 +343,7 @@ class BulkRow(Base):
     created_at: Mapped[float]
     running_since: Mapped[float | None]
     ended_at: Mapped[float | None]
+    changed_at: Mapped[float] = _change_time()
     listed: Mapped[bool]  # whether all files have been listed as items
     lister: Mapped[str | None] = mapped_column(
         String(32)
@@ -335,7 +359,7 @@ class BulkRow(Base):
     __table_args__ = (
         _listed("bulks"),
         Index("bulks_by_phase", "phase"),
-        Index("bulks_ended", "owner", "ended_at", "id"),
+        Index("bulks_changed", "owner", "changed_at", "id"),
         # If two identical requests arrive at the same moment, the second insert fails; the request then finds the first run.
         _partial("one_open_bulk_a_request", _OPEN, "owner", "request_key", unique=True),
     )

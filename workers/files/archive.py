@@ -46,7 +46,7 @@ Place = tuple[str, ...]
 
 
 @dataclass(frozen=True)
-class Looked:
+class Entry:
     """A folder or an entry of a folder at which a search looked.
 
     place: the names of the folders below the fixed part of the pattern, and then the name of the entry; for a folder
@@ -94,7 +94,7 @@ def check_glob(glob: str, allowed: Sequence[Path]) -> None:
     check_under(folder, allowed)
 
 
-def find(glob: str, allowed: Sequence[Path], after: Place | None = None) -> Iterator[Looked]:
+def find(glob: str, allowed: Sequence[Path], after: Place | None = None) -> Iterator[Entry]:
     """Find the files that a pattern matches, and yield every folder and entry at which the search looks, each once.
 
     The entries of a folder are sorted by name; those of its subfolders follow. Links that lead out of the allowed
@@ -166,9 +166,7 @@ def _split(glob: str) -> tuple[Path, tuple[str, ...]]:
     return Path(*path.parts[:fixed]), tuple(parts)
 
 
-def _walk(
-    top: Path, parts: tuple[str, ...], allowed: Sequence[Path], after: Place | None
-) -> Iterator[Looked]:
+def _walk(top: Path, parts: tuple[str, ...], allowed: Sequence[Path], after: Place | None) -> Iterator[Entry]:
     """Read each folder only once, and compare its entries with all parts of the pattern that can match at this depth.
 
     Several ** in a pattern therefore cost no additional time.
@@ -177,7 +175,7 @@ def _walk(
     while left:
         folder, names, indices = left.pop()
         if _is_after((*names, ""), after):
-            yield Looked(folder, (*names, ""))
+            yield Entry(folder, (*names, ""))
         # ** also matches no folder.
         indices |= {index + 1 for index in indices if parts[index] == ANY_FOLDERS}
         below: list[tuple[Path, Place, frozenset[int]]] = []
@@ -192,7 +190,7 @@ def _walk(
                 )
                 error = DataError("unreadable-file", message)
             if _is_after(place, after):
-                yield Looked(path, place, meant, error)
+                yield Entry(path, place, meant, error)
             if further and _leads_after(place, after):
                 below.append((path, place, further))
         left += reversed(below)

@@ -43,7 +43,7 @@ MOST_SEARCHED = 500
 
 
 @dataclass(frozen=True)
-class Found:
+class SearchResult:
     """The result of a search for one PSF."""
 
     wanted: PsfFilter
@@ -113,68 +113,83 @@ class Found:
         return {name: value for name, value in said.items() if value is not None}
 
 
-def look(catalogue: Catalogue, wanted: PsfFilter, owner: str, context: str | None) -> Found:
+def look(catalogue: Catalogue, wanted: PsfFilter, owner: str, context: str | None) -> SearchResult:
     """The PSFs that meet the filters. context: an id, a name or "now"; None: the owner's default context.
 
     If there is no context, and the filters name no status, only certified PSFs are searched.
 
     Raises ``DataError`` "no-such-context".
     """
-    pinned = catalogue.contexts.asked_for(context, owner)
+    return _look(catalogue, wanted, owner, catalogue.contexts.asked_for(context, owner))
+
+
+def _look(catalogue: Catalogue, wanted: PsfFilter, owner: str, pinned: PsfContextRow | None) -> SearchResult:
     if pinned is not None:
         wanted = replace(wanted, context_id=pinned.id)
     elif wanted.status is None:
         wanted = replace(wanted, status=PsfStatus.CERTIFIED)
     psfs = catalogue.psfs.page(wanted, owner, limit=MOST_NAMED + 1)
-    return Found(wanted, pinned, psfs, None if psfs else catalogue.psfs.emptied_by(wanted, owner))
+    return SearchResult(wanted, pinned, psfs, None if psfs else catalogue.psfs.emptied_by(wanted, owner))
 
 
 def look_for_image(
     catalogue: Catalogue, header: Mapping[str, Any], owner: str, context: str | None, kind: str = TOTAL
-) -> Found:
+) -> SearchResult:
     """The PSFs for the instrument, channel and time of an image. header: the header summary that is stored with the upload.
 
     If the channel has variants, the filter and the plate scale in the header choose the variant.
     Raises ``DataError`` "no-instrument", "no-date", "no-such-context" or "several-variants-fit".
     """
-    instrument, channel = _seen_as(catalogue, header, owner, context, kind)
+    pinned = catalogue.contexts.asked_for(context, owner)
+    instrument, channel = _seen_as(catalogue, header, owner, pinned, kind)
     if instrument is None:
         raise DataError(
             "no-instrument",
             "expected DETECTOR or INSTRUME in the image's header; got neither: name the PSF in the request",
         )
+    return _look_at_time_of(header, PsfFilter(instrument, channel, kind), catalogue, owner, pinned)
+
+
+def _look_at_time_of(
+    header: Mapping[str, Any],
+    wanted: PsfFilter,
+    catalogue: Catalogue,
+    owner: str,
+    pinned: PsfContextRow | None,
+) -> SearchResult:
+    """The PSFs of a series at the time of an image. Raises ``DataError`` "no-date"."""
     try:
         at = seconds(header["date_obs"] or "")
     except DataError:  # the keyword contains a text that is not a time; a missing time is reported below
         at = None
-    found = look(catalogue, PsfFilter(instrument, channel, kind, valid_at=at), owner, context)
+    found = _look(catalogue, replace(wanted, valid_at=at), owner, pinned)
     if at is None and any((psf.valid_from, psf.valid_to) != (-math.inf, math.inf) for psf in found.psfs):
         raise DataError(
             "no-date",
             f"expected DATE-BEG or DATE-OBS in the image's header, in the form 2024-03-01T12:00:00, because PSFs of "
-            f"{series_of(instrument, channel, kind)} are valid only for some times; got {header['date_obs']!r}: "
+            f"{wanted.series or wanted.instrument} are valid only for some times; got {header['date_obs']!r}: "
             "name the PSF in the request",
         )
-    if at is None or found.psfs or kind != TOTAL:
+    if at is None or found.psfs or wanted.kind != TOTAL:
         return found
-    series = series_of(instrument, channel, kind)
+    series = series_of(wanted.instrument, wanted.channel, TOTAL)
     assert series is not None
-    context_id = None if found.context is None else found.context.id
-    return replace(found, ends=catalogue.series.ends(series, at, owner, context_id))
+    return replace(found, ends=catalogue.series.ends(series, at, owner, found.wanted.context_id))
 
 
 def picked_for_image(
     catalogue: Catalogue, header: Mapping[str, Any], owner: str, context: str | None
-) -> Found | None:
+) -> SearchResult | None:
     """Find the PSF for an image if the request names no PSF; None if the series of the image has no certified PSF.
 
     Raises the same ``DataError`` as ``look_for_image``, and "no-psf-fits" if the series has PSFs, but the context contains none of them.
     """
-    instrument, channel = _seen_as(catalogue, header, owner, context, TOTAL)
-    series = series_of(instrument, channel, TOTAL)
     pinned = catalogue.contexts.asked_for(context, owner)
+    instrument, channel = _seen_as(catalogue, header, owner, pinned, TOTAL)
+    series = series_of(instrument, channel, TOTAL)
+    wanted = PsfFilter(instrument, channel, TOTAL)
     if series is not None and pinned is not None and catalogue.contexts.any_pinned(pinned.id, series, owner):
-        return look_for_image(catalogue, header, owner, context)
+        return _look_at_time_of(header, wanted, catalogue, owner, pinned)
     certified = series is not None and catalogue.psfs.any_certified(series, owner)
     if pinned is not None and (certified or context is not None):
         raise DataError(
@@ -182,7 +197,7 @@ def picked_for_image(
             f"expected context {pinned.name} to pin a PSF of {series or 'an instrument'}; it pins none: name a PSF, or "
             f"use context {NOW!r} for the PSFs that are certified now",
         )
-    return look_for_image(catalogue, header, owner, context) if certified else None
+    return _look_at_time_of(header, wanted, catalogue, owner, pinned) if certified else None
 
 
 def seen_through(header: Mapping[str, Any]) -> tuple[str | None, str | None]:
@@ -192,16 +207,15 @@ def seen_through(header: Mapping[str, Any]) -> tuple[str | None, str | None]:
 
 
 def _seen_as(
-    catalogue: Catalogue, header: Mapping[str, Any], owner: str, context: str | None, kind: str
+    catalogue: Catalogue, header: Mapping[str, Any], owner: str, pinned: PsfContextRow | None, kind: str
 ) -> tuple[str | None, str | None]:
     """The instrument and the channel of an image, with the variant of the channel to which the image belongs, if any.
 
-    Raises ``DataError`` "no-such-context" or "several-variants-fit".
+    Raises ``DataError`` "several-variants-fit".
     """
     instrument, channel = seen_through(header)
     if instrument is None or channel is None:
         return instrument, channel
-    pinned = catalogue.contexts.asked_for(context, owner)
     known = catalogue.series.variants(instrument, channel, kind, owner, None if pinned is None else pinned.id)
     return instrument, variant_for(header["cards"], known) or channel
 
@@ -257,11 +271,10 @@ def _why(
     if resolved.psf_recipe is not None:
         return _why_built(wanted, catalogue, owner) + "."
     seen = f"the images of {row.series} at the time of this image"
-    context = catalogue.contexts.asked_for(wanted.context, owner)
-    if context is None or resolved.context_id is None:
+    if resolved.context_id is None:
         return f"This PSF is certified for {seen}."
     which = "The default context" if wanted.context is None else "Context"
-    return f"{which} {context.name} pins this PSF for {seen}."
+    return f"{which} {catalogue.contexts.named(resolved.context_id, owner).name} pins this PSF for {seen}."
 
 
 def _why_interpolated(asked: PsfInterpolate, catalogue: Catalogue, owner: str) -> str:

@@ -27,13 +27,13 @@ from workers.contract.kinds import KINDS, JobRequest, Kind, load
 from workers.contract.requests import Deconvolve, Parameters, PsfBuild, ResolvedDeconvolve
 from workers.intake import compatibility
 from workers.intake.compatibility import check_not_deprecated
-from workers.intake.psf_choice import Found, no_psf, picked_for_image
+from workers.intake.psf_choice import SearchResult, no_psf, picked_for_image
 from workers.lineage import made_by
 from workers.rows import row_of
 
 
 @dataclass(frozen=True)
-class Asked:
+class Submission:
     """The parameters of a request, and the objects that are needed to resolve them."""
 
     kind: Kind
@@ -64,7 +64,7 @@ def resolve(
     """
     kind = KINDS[request.kind]
     resolver = load(kind.resolver)
-    resolved: Parameters = resolver(Asked(kind, request.parameters, catalogue, owner, added_effects))
+    resolved: Parameters = resolver(Submission(kind, request.parameters, catalogue, owner, added_effects))
     if kind.identity is None:
         # A random identity, because every job of this kind makes a new result.
         identity = canonical_hash({"kind": kind.name, "asked": uuid.uuid4().hex})
@@ -73,7 +73,7 @@ def resolve(
     return resolved.model_dump(mode="json"), identity
 
 
-def resolve_by_ids(asked: Asked) -> Parameters:
+def resolve_by_ids(asked: Submission) -> Parameters:
     """Check the ids in the parameters, and add the recipe of the diffraction PSF if the kind needs one.
 
     A parameter is an id if its name is ``image_id``, ``psf_id`` or ``transit_id``, or ends in ``_image_id``, ``_psf_id`` or
@@ -91,7 +91,7 @@ def resolve_by_ids(asked: Asked) -> Parameters:
     return asked.resolved(diffraction_recipe=_diffraction_of(asked, summary))
 
 
-def resolve_psf_build(asked: Asked) -> Parameters:
+def resolve_psf_build(asked: Submission) -> Parameters:
     """Check the instrument file and the mask of a PSF build."""
     build: PsfBuild = asked.parameters
     label = build.instrument or "instrument_file"
@@ -101,7 +101,7 @@ def resolve_psf_build(asked: Asked) -> Parameters:
     return build
 
 
-def resolve_report(asked: Asked) -> Parameters:
+def resolve_report(asked: Submission) -> Parameters:
     """Resolve a report. A report on a given PSF needs no fit, and therefore no diffraction PSF and no dark offsets."""
     if asked.parameters.psf_id is None:
         return resolve_by_ids(asked)
@@ -112,7 +112,7 @@ def resolve_report(asked: Asked) -> Parameters:
     return asked.resolved(dark_offsets=False)
 
 
-def resolve_gap_diagnose(asked: Asked) -> Parameters:
+def resolve_gap_diagnose(asked: Submission) -> Parameters:
     """Resolve a diagnosis: also record the effects that the operator adds, and the SHA-256 of their source texts."""
     added = asked.added_effects
     fields = {"added_effects": added, "added_effects_sha256": tuple(map(sha256_of_source, added))}
@@ -120,14 +120,14 @@ def resolve_gap_diagnose(asked: Asked) -> Parameters:
     return resolved.model_validate(resolved.model_dump(mode="json") | fields)
 
 
-def resolve_rerun(asked: Asked) -> Parameters:
+def resolve_rerun(asked: Submission) -> Parameters:
     """Resolve a rerun: find the job that made the product or PSF."""
     again = asked.parameters
     row = asked.row(PsfRow, again.id) if again.of == "psf" else asked.row(ProductRow, again.id)
     return made_by(asked.catalogue, row)
 
 
-def resolve_deconvolve(asked: Asked) -> Parameters:
+def resolve_deconvolve(asked: Submission) -> Parameters:
     """Resolve a deconvolution: also choose its PSF."""
     image = asked.row(ImageRow, asked.parameters.image_id)
     return resolved_deconvolution(asked.parameters, image.summary, asked.catalogue, asked.owner)
@@ -153,7 +153,7 @@ def resolved_deconvolution(
 _TABLES: dict[str, Any] = {"image": ImageRow, "psf": PsfRow, "transit": TransitRow}
 
 
-def _diffraction_of(asked: Asked, summary: dict[str, Any]) -> PsfBuild | None:
+def _diffraction_of(asked: Submission, summary: dict[str, Any]) -> PsfBuild | None:
     """The recipe of the diffraction PSF of a transit; None if the transit contains this PSF."""
     recipe = diffraction_build(summary, asked.parameters.noise)
     if recipe is None:
@@ -196,7 +196,7 @@ def _psf_for(catalogue: Catalogue, header: dict[str, Any], wanted: Deconvolve, o
     return {"psf_id": identity, "psf_recipe": recipe}
 
 
-def _certified(catalogue: Catalogue, owner: str, found: Found) -> dict[str, Any]:
+def _certified(catalogue: Catalogue, owner: str, found: SearchResult) -> dict[str, Any]:
     """The certified PSF that was found, or how it is interpolated between two certified PSFs."""
     interpolation = found.interpolation
     if interpolation is None:

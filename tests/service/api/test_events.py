@@ -6,7 +6,7 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import groupby
 from typing import Any
@@ -14,24 +14,23 @@ from typing import Any
 import httpx
 import pytest
 from fastapi.testclient import TestClient
-from pydantic import BaseModel
 from sqlalchemy import Engine, event, update
 from sqlalchemy.exc import OperationalError
 
 from service.api import events
+from service.api.bulk import BulkLine
 from service.client.http import ServiceError
 from service.http import lookout
 from service.http.callers import Caller
-from service.http.lookout import Follower, OwnerFollower, RowFollower, Watch
+from service.http.lookout import Follower, Kind, Lookout, OwnerFollower
 from service.views import JobView
 from tests.service.conftest import execute, refusal
 from tests.service.keyed import bearer, keyed
 from tests.service.serving import Following, Live, in_own_loop, running
 from tests.whole.stack import wait_for
-from workers.catalogue import followed
+from workers.catalogue import changes
 from workers.catalogue.bulks import new_id
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.followed import Place
 from workers.catalogue.jobs import Lease
 from workers.catalogue.tables import DEFAULT_OWNER, BulkRow, JobRow, KeyRow
 from workers.contract.bulk import BulkPhase
@@ -111,21 +110,18 @@ def test_a_stream_ends_with_its_key(settings: Settings, monkeypatch: pytest.Monk
             key = service.key("ann")
             job, _ = service.catalogue.jobs.submit("psf-build", {}, how, "ann")
             end = update(KeyRow).where(KeyRow.id == key.split("_")[1]).values(**change)
-            read, looks = service.catalogue.followed_jobs.named, []
+            read, looks = service.catalogue.job_changes.among, []
 
-            def look(
-                ids: Any, read: Any = read, looks: list[str] = looks, end: Any = end
-            ) -> dict[str, JobRow]:
+            def look(*ids: Any, read: Any = read, looks: list[Any] = looks, end: Any = end) -> Any:
                 looks.append(ids)
                 if len(looks) == 5:  # the stream is open and has sent an event
                     execute(service.catalogue, end)
-                rows: dict[str, JobRow] = read(ids)
-                return rows
+                return read(*ids)
 
             with monkeypatch.context() as patched:
-                patched.setattr(service.catalogue.followed_jobs, "named", look)
+                patched.setattr(service.catalogue.job_changes, "among", look)
                 said = service.api.get(f"/v1/jobs/{job.id}/events", headers=bearer(key))
-            assert said.status_code == 200 and len(looks) == 5
+            assert said.status_code == 200 and len(looks) >= 5
             assert said.text.count("event: progress") == 1 and "event: end" not in said.text
             refused = service.api.get(f"/v1/jobs/{job.id}/events", headers=bearer(key))
             refusal(refused, 401, f"key-{how}")
@@ -143,40 +139,36 @@ def catalogue(settings: Settings) -> Iterator[Catalogue]:
     catalogue.close()
 
 
-class Line(BaseModel):
-    id: str
-    phase: str
+def lookout_of(
+    catalogue: Catalogue, kind: str = "job", let_in: Callable[[Any], bool] = lambda _: True
+) -> Lookout:
+    """For the jobs or the bulk runs of the owner."""
+    jobs = Kind("job", catalogue.job_changes, JobView.of)
+    bulks = Kind("bulk", catalogue.bulk_changes, BulkLine.model_validate)
+    return Lookout(DEFAULT_OWNER, [jobs if kind == "job" else bulks], catalogue.census.clock, let_in)
 
-    @classmethod
-    def of(cls, row: BulkRow) -> Line:
-        return cls(id=row.id, phase=row.phase)
+
+def follower_of(*named: str, kind: str = "job", since: float | None = None) -> OwnerFollower:
+    """A stream of all jobs or bulk runs of the owner."""
+    after = None if since is None else [(since, "")]
+    return OwnerFollower(CALLER, [(kind, one) for one in named], after)
 
 
 class Looks:
     """The news of one look after the other, as (name of the event, data)."""
 
-    watch: Watch[Any]
-
-    def __init__(self, catalogue: Catalogue, *named: str, since: float | None = None) -> None:
-        rows = catalogue.followed_jobs
-        since = rows.now() - lookout.OVERLAP_S if since is None else since
-        self.watch = Watch("job", rows, JobView.of, DEFAULT_OWNER, frozenset(named), Place(since))
+    def __init__(
+        self, catalogue: Catalogue, *named: str, kind: str = "job", since: float | None = None
+    ) -> None:
+        self.lookout = lookout_of(catalogue, kind)
+        self.follower = follower_of(*named, kind=kind, since=since)
 
     def told(self) -> list[tuple[str, dict[str, Any]]]:
-        news, self.watch = self.watch.look()
-        return [_parsed(one.text) for one in news]
+        text, _ = self.lookout.look_for(self.follower)
+        return [_parsed(block) for block in text.split("\n\n") if "event: " in block]
 
     def phases(self) -> list[tuple[str, str]]:
         return [(data["id"], data.get("phase", name)) for name, data in self.told()]
-
-
-class BulkLooks(Looks):
-    """The same for bulk runs."""
-
-    def __init__(self, catalogue: Catalogue, *named: str) -> None:
-        rows = catalogue.followed_bulks
-        since = Place(rows.now() - lookout.OVERLAP_S)
-        self.watch = Watch("bulk", rows, Line.of, DEFAULT_OWNER, frozenset(named), since, after_end=2)
 
 
 def _parsed(text: str) -> tuple[str, dict[str, Any]]:
@@ -198,7 +190,7 @@ def ended_long_ago(catalogue: Catalogue, job_id: str, ago_s: float = 3600.0) -> 
     """Complete a job and let its end lie in the past; returns that time."""
     at = time.time() - ago_s
     catalogue.jobs.complete(claimed(catalogue, job_id), "r" * 64)
-    execute(catalogue, update(JobRow).where(JobRow.id == job_id).values(ended_at=at))
+    execute(catalogue, update(JobRow).where(JobRow.id == job_id).values(ended_at=at, changed_at=at))
     return at
 
 
@@ -251,23 +243,24 @@ def test_a_bulk_run_that_ended_some_time_ago_is_followed_until_it_is_deleted(
     catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(lookout, "OVERLAP_S", 0.0)
+    monkeypatch.setattr(lookout, "MOST_KNOWN", 2)
     runs = [bulk_run(catalogue) for _ in range(3)]
     before = bulk_run(catalogue)
     catalogue.bulks.cancel(before)
     time.sleep(0.01)
-    looks = BulkLooks(catalogue)
+    looks = Looks(catalogue, kind="bulk")
     looks.told()
     for run in runs:
         catalogue.bulks.cancel(run)
         time.sleep(0.01)
         assert looks.phases() == [(run, "CANCELLED")]
     assert looks.told() == []
-    assert set(looks.watch.known) == set(runs[1:]), "the two that ended last"
+    assert {one for _, one in looks.follower.known} == set(runs[1:]), "the two that ended last"
     for run in (before, *runs):
         assert catalogue.bulks.delete(run)
     assert sorted(looks.phases()) == sorted((run, "gone") for run in runs[1:])
     assert looks.told() == []
-    assert BulkLooks(catalogue, before).phases() == [(before, "gone")], "as a name that nothing has"
+    assert Looks(catalogue, before, kind="bulk").phases() == [(before, "gone")], "as a name that nothing has"
 
 
 def test_other_owners_and_turns_of_bulk_runs_are_not_told(catalogue: Catalogue) -> None:
@@ -282,13 +275,13 @@ def test_other_owners_and_turns_of_bulk_runs_are_not_told(catalogue: Catalogue) 
 def test_ends_since_a_time_come_in_pages_that_lose_none(
     catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (followed, lookout):
+    for module in (changes, lookout):
         monkeypatch.setattr(module, "MOST", 3)
     ids = [submitted(catalogue) for _ in range(10)]
     at = time.time() - 3600.0
     for number, job_id in enumerate(ids):  # several ended at the same moment
         ended_long_ago(catalogue, job_id)
-        ended = update(JobRow).where(JobRow.id == job_id).values(ended_at=at + number // 4)
+        ended = update(JobRow).where(JobRow.id == job_id).values(changed_at=at + number // 4)
         execute(catalogue, ended)
     looks = Looks(catalogue, since=at - 1)
     pages = [looks.phases() for _ in range(6)]
@@ -299,14 +292,12 @@ def test_ends_since_a_time_come_in_pages_that_lose_none(
 def test_of_very_many_waiting_jobs_the_newest_are_told_and_every_end(
     catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (followed, lookout):
+    for module in (changes, lookout):
         monkeypatch.setattr(module, "MOST", 3)
     ids = [submitted(catalogue) for _ in range(5)]
+    execute(catalogue, update(JobRow).values(changed_at=time.time() - 3600.0))
     looks = Looks(catalogue)
     assert sorted(job_id for job_id, _ in looks.phases()) == sorted(ids[2:])
-    newer = [submitted(catalogue) for _ in range(2)]
-    assert sorted(job_id for job_id, _ in looks.phases()) == sorted(newer)
-    assert set(looks.watch.known) == {ids[4], *newer}, "what is not looked at is forgotten"
     lease = claimed(catalogue, ids[0])
     assert looks.phases() == [(ids[0], "EXECUTING")]
     catalogue.jobs.complete(lease, "r" * 64)
@@ -329,18 +320,10 @@ def test_many_jobs_need_as_few_queries_as_one(catalogue: Catalogue) -> None:
         statements.clear()
         assert sorted(job_id for job_id, _ in looks.phases()) == sorted(ids)
         counts.append(len(statements))
-    assert counts == [5, 5]  # clock, ended, two phases, and the rows that have changed
+    assert counts == [4, 3]  # clock, changes, at first the open ones, and rows
     statements.clear()
-    assert looks.told() == [] and len(statements) == 4
+    assert looks.told() == [] and len(statements) == 2
     event.remove(Engine, "before_cursor_execute", count)
-
-
-def follower_of(catalogue: Catalogue, *named: str, last_id: str | None = None) -> OwnerFollower:
-    """A stream of all jobs of the owner."""
-    watch = Watch(
-        "job", catalogue.followed_jobs, JobView.of, DEFAULT_OWNER, frozenset(named), Place(time.time() - 10.0)
-    )
-    return OwnerFollower(CALLER, [watch])
 
 
 def test_all_streams_of_an_owner_need_as_few_queries_as_one(
@@ -355,11 +338,9 @@ def test_all_streams_of_an_owner_need_as_few_queries_as_one(
             statements.append(statement)
 
     async def queries(many: int) -> int:
-        seen = lookout.Lookout(lambda caller: catalogue.keys.is_good(caller.name) or True)
-        followers: list[Follower] = [follower_of(catalogue) for _ in range(many)]
-        followers += [
-            RowFollower(CALLER, catalogue.followed_jobs, one, JobView.of, None) for one in ids[:many]
-        ]
+        seen = lookout_of(catalogue, let_in=lambda caller: catalogue.keys.is_good(caller.name) or True)
+        followers: list[Follower] = [follower_of() for _ in range(many)]
+        followers += [Follower(CALLER, {("job", one): ""}) for one in ids[:many]]
         assert all([(await seen.next(one))[0] for one in followers])
         statements.clear()
         assert {await seen.next(one) for one in followers} == {("", False)}
@@ -367,10 +348,8 @@ def test_all_streams_of_an_owner_need_as_few_queries_as_one(
 
     event.listen(Engine, "before_cursor_execute", count)
     try:
-        assert [in_own_loop(partial(queries, many)) for many in (1, 20)] == [
-            6,
-            6,
-        ]  # key, rows, and those of a watch
+        counts = [in_own_loop(partial(queries, many)) for many in (1, 20)]
+        assert counts == [3, 3]  # key, clock and changes
     finally:
         event.remove(Engine, "before_cursor_execute", count)
 
@@ -383,7 +362,7 @@ def test_a_stream_that_comes_later_knows_all_and_takes_nothing_from_the_others(
     ended_long_ago(catalogue, long_ago)
 
     async def follow() -> None:
-        seen, first = lookout.Lookout(lambda _: True), follower_of(catalogue)
+        seen, first = lookout_of(catalogue), follower_of()
 
         async def until(follower: Follower, *expected: str) -> list[tuple[str, str]]:
             """The events for jobs, up to one that contains these texts."""
@@ -395,7 +374,7 @@ def test_a_stream_that_comes_later_knows_all_and_takes_nothing_from_the_others(
 
         await until(first, "id: ")
         fresh = submitted(catalogue)
-        later = follower_of(catalogue, long_ago)
+        later = follower_of(long_ago)
         told = await until(later, "id: ")
         assert told == [(long_ago, "COMPLETED"), (fresh, "QUEUED")]
         assert await until(first, fresh) == [(fresh, "QUEUED")], "its end was not known to the first"
@@ -421,7 +400,7 @@ def test_a_look_that_fails_loses_nothing(catalogue: Catalogue, monkeypatch: pyte
         raise OperationalError("SELECT", {}, Exception("the database is away"))
 
     with monkeypatch.context() as broken:
-        broken.setattr(catalogue.followed_jobs, "rows", away)
+        broken.setattr(catalogue.job_changes, "rows", away)
         with pytest.raises(OperationalError):
             looks.told()
     assert looks.phases() == [(job_id, "QUEUED")]
@@ -497,8 +476,8 @@ def test_named_ones_are_sent_first(settings: Settings) -> None:
         others, theirs = bulk_run(catalogue, "ann"), bulk_run(catalogue, "bob")
         query = [("job", old), ("bulk", run), ("bulk", theirs)]
         told, _ = once(ann, params=query)
-        assert [data["id"] for _, data in told[:3]] == [old, run, theirs]
-        assert [name for name, _ in told] == ["job", "bulk", "gone", "job", "job", "job", "bulk"]
+        assert {data["id"] for _, data in told[:3]} == {old, run, theirs}
+        assert [name for name, _ in told[3:]] == ["job", "job", "job", "bulk"]
         assert told[-1][1]["id"] == others
         refused = ann.get("/v1/events", params=[("job", new_id()) for _ in range(51)])
         assert refused.status_code == 422

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
-from sqlalchemy import insert, text
+from sqlalchemy import insert, text, update
 
 from psfcore.errors import DataError
 from tests.whole.many_rows import plan, statements
 from tests.workers.databases import BOTH, change, database
 from tests.workers.jobs import Bench, bulk_row, claimed
 from tests.workers.psf_examples import psf
-from workers.catalogue import followed
+from workers.catalogue import changes
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.census import FileTally
-from workers.catalogue.followed import Place
+from workers.catalogue.changes import Moment
 from workers.catalogue.tables import DEFAULT_OWNER, ImageRow, JobRow
 from workers.contract.jobs import Phase
 from workers.stage_timer import Spent
@@ -108,7 +108,7 @@ def job(number: int, owner: str = "ann", **values: object) -> dict[str, object]:
     key = f"{number:064x}"
     return {
         "id": f"{number:032x}", "owner": owner, "kind": "psf-build", "parameters": {}, "request_key": key, "work_key": key,
-        "phase": "COMPLETED", "created_at": float(number), "ended_at": float(number), **values,
+        "phase": "COMPLETED", "created_at": float(number), "changed_at": float(number), **values,
     }  # fmt: skip
 
 
@@ -116,30 +116,56 @@ def add_jobs(catalogue: Catalogue, *jobs: dict[str, object]) -> None:
     change(catalogue, *(insert(JobRow).values(**one) for one in jobs))
 
 
-def test_rows_are_read_by_owner_phase_and_end(catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(followed, "MOST", 2)
+def numbers(found: Sequence[Moment]) -> list[int]:
+    return [int(identity, 16) for _, identity in found]
+
+
+def test_rows_are_read_by_owner_phase_and_change(
+    catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(changes, "MOST", 2)
     add_jobs(
         catalogue,
         *(job(number) for number in (1, 2, 3, 4)),
-        *(job(number, phase="QUEUED", ended_at=None) for number in (5, 6, 7)),
-        job(8, phase="EXECUTING", ended_at=None),
+        *(job(number, phase="QUEUED") for number in (5, 6, 7)),
+        job(0, phase="EXECUTING"),
         job(9, "bob"),
-        job(10, "bob", phase="EXECUTING", ended_at=None),
-        job(11, kind="bulk", phase="EXECUTING", ended_at=None),
-        job(12, phase="PENDING", ended_at=None),
+        job(10, "bob", phase="EXECUTING"),
+        job(11, kind="bulk", phase="EXECUTING"),
+        job(12, phase="PENDING"),
     )
-    jobs = catalogue.followed_jobs
-    assert [int(one.id, 16) for one in jobs.open("ann")] == [8, 7, 6], "two of each phase, newest first"
-    assert [int(one.id, 16) for one in jobs.ended("ann", Place(2.0))] == [2, 3]
-    assert [int(one.id, 16) for one in jobs.ended("ann", Place(3.0, f"{3:032x}"))] == [4]
-    asked = [f"{number:032x}" for number in (1, 9, 11, 12, 99)]
-    assert sorted(int(one.id, 16) for one in jobs.among("ann", asked)) == [1, 12]
-    assert jobs.among("ann", []) == [] and jobs.rows("ann", []) == {}
-    found = jobs.rows("ann", asked)
-    assert {one: state for one, (state, _) in found.items()} == {
-        state.id: state for state in jobs.among("ann", asked)
-    }
-    assert jobs.now() == pytest.approx(time.time(), abs=5)
+    jobs = catalogue.job_changes
+    assert numbers(jobs.open("ann")) == [0, 7], "those at work, and then the newest"
+    assert numbers(jobs.since("ann", (2.0, ""))) == [2, 3] and numbers(jobs.since("ann", (7.0, ""))) == [7]
+    assert numbers(jobs.since("ann", (3.0, f"{3:032x}"))) == [4, 5]
+    ids = [f"{number:032x}" for number in (1, 9, 12, 99)]
+    assert sorted(numbers(jobs.among("ann", ids))) == [1, 12]
+    assert jobs.among("ann", []) == [] == jobs.rows([])
+    assert {row.id for row in jobs.rows(ids)} == set(ids[:3])
+
+
+@BOTH
+def test_every_change_that_a_reader_can_see_has_a_later_time(catalogue: Catalogue) -> None:
+    """Also if the clock does not move, or was set back."""
+    job, _ = catalogue.jobs.submit("psf-build", {}, "a", DEFAULT_OWNER)
+    times = [job.changed_at]
+
+    def changed() -> bool:
+        times.append(catalogue.job_changes.among(DEFAULT_OWNER, [job.id])[0][0])
+        return times[-1] > times[-2]
+
+    assert times[0] == pytest.approx(catalogue.census.clock(), abs=5) and not changed()
+    ahead = catalogue.census.clock() + 3600.0
+    change(catalogue, update(JobRow).values(changed_at=ahead))
+    assert changed()
+    catalogue.jobs.mark_submitted(job.id)
+    assert not changed()
+    lease = claimed(catalogue, job.id)
+    assert changed()
+    catalogue.jobs.heartbeat(lease)
+    assert not changed()
+    catalogue.jobs.progress(lease, "building", 1, 2)
+    assert changed() and times[-1] == pytest.approx(ahead, abs=1)
 
 
 def test_open_bulk_runs_are_followed_also_when_paused(catalogue: Catalogue) -> None:
@@ -149,9 +175,10 @@ def test_open_bulk_runs_are_followed_also_when_paused(catalogue: Catalogue) -> N
         ids.append(catalogue.bulks.create(row, ["a" * 64])[0].id)
     catalogue.bulks.pause(ids[0])
     catalogue.bulks.cancel(ids[1])
-    bulks = catalogue.followed_bulks
-    assert [one.id for one in bulks.open("ann")] == [ids[2], ids[0]] and bulks.open("bob") == []
-    assert [one.id for one in bulks.ended("ann", Place(time.time() - 60))] == [ids[1]]
+    bulks = catalogue.bulk_changes
+    assert [one for _, one in bulks.open("ann")] == [ids[2], ids[0]] and bulks.open("bob") == []
+    changed = [one for _, one in bulks.since("ann", (catalogue.census.clock() - 60, ""))]
+    assert changed == [ids[2], ids[0], ids[1]]
 
 
 @BOTH
@@ -161,16 +188,16 @@ def test_every_query_uses_an_index_on_what_it_asks_for(catalogue: Catalogue) -> 
         connection.execute(insert(JobRow), [job(number) for number in range(2000)])
     with database(catalogue).engine.execution_options(isolation_level="AUTOCOMMIT").connect() as connection:
         connection.execute(text("ANALYZE"))
-    jobs = catalogue.followed_jobs
+    jobs = catalogue.job_changes
     with statements() as sent:
-        jobs.ended("ann", Place(1990.0)), jobs.open("ann"), jobs.among("ann", [ANY]), jobs.rows("ann", [ANY])
+        jobs.since("ann", (1990.0, "")), jobs.open("ann"), jobs.among("ann", [ANY]), jobs.rows([ANY])
     plans = [
         "\n".join(plan(database(catalogue), *one, forced=False))
         for one in sent
         if one[0].startswith("SELECT")
     ]
-    ended, executing, queued, among, read = plans
-    assert "jobs_ended" in ended and "ended_at" in ended
-    assert all("USING INDEX jobs_" in one or "Index Scan" in one for one in (executing, queued)), plans
+    since, still_open, among, read = plans
+    assert "jobs_changed" in since and "changed_at" in since
+    assert "USING INDEX jobs_" in still_open or "Index Scan" in still_open, plans
     assert not any("SCAN jobs" in one or "Seq Scan" in one for one in plans), plans
     assert all("id" in one for one in (among, read))

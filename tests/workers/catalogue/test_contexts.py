@@ -9,9 +9,18 @@ from typing import Any
 import pytest
 
 from tests.workers.databases import BOTH
-from tests.workers.psf_examples import OWNER, certify, deprecate, header_of, identity, psf, refused, years
+from tests.workers.psf_examples import (
+    OWNER,
+    certify,
+    deprecate,
+    header_of,
+    identity,
+    pin,
+    psf,
+    refused,
+    years,
+)
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.contexts import Pin
 from workers.catalogue.psfs import PsfFilter
 from workers.intake.psf_choice import look, look_for_image, picked_for_image
 from workers.versions import iso, seconds
@@ -73,9 +82,9 @@ def test_the_same_set_under_the_same_name_is_the_same_context(certified: Catalog
 
 def test_a_context_of_given_psfs(certified: Catalogue) -> None:
     pins = [
-        Pin(identity("draft"), years(2022, None)),
-        Pin(identity("a")),
-        Pin(identity("b"), years(2021, 2022)),
+        pin("draft", years(2022, None)),
+        pin("a"),
+        pin("b", years(2021, 2022)),
     ]
     certified.contexts.create("mixed", OWNER, "x", pins=pins)
     assert [pin[1:] for pin in pinned(certified, "mixed")] == [
@@ -94,12 +103,12 @@ def test_invalid_contexts_are_refused(certified: Catalogue) -> None:
         refused("bad-name", lambda name=name: create(name, OWNER, "x"))
     refused("nothing-to-pin", lambda: create("empty", OWNER, "x", pins=[]))
     refused("nothing-to-pin", lambda: create("empty", "somebody", "x"))
-    refused("no-such-psf", lambda: create("wrong", OWNER, "x", pins=[Pin(identity("nobody"))]))
-    twice = [Pin(identity("a")), Pin(identity("draft"), years(2020, 2021))]
+    refused("no-such-psf", lambda: create("wrong", OWNER, "x", pins=[pin("nobody")]))
+    twice = [pin("a"), pin("draft", years(2020, 2021))]
     message = refused("ranges-overlap", lambda: create("twice", OWNER, "x", pins=twice))
     assert identity("a") in message and identity("draft") in message
     certified.add(psf("nameless", instrument=None))
-    refused("no-line", lambda: create("wrong", OWNER, "x", pins=[Pin(identity("nameless"))]))
+    refused("no-line", lambda: create("wrong", OWNER, "x", pins=[pin("nameless")]))
     for name in ("empty", "wrong", "twice"):
         assert certified.contexts.find(name, OWNER) is None
 
@@ -167,7 +176,7 @@ def test_only_certified_psfs_are_searched_by_default_and_one_must_fit(certified:
 
 
 def test_the_default_context_is_searched_unless_the_request_says_now(certified: Catalogue) -> None:
-    certified.contexts.create("old", OWNER, "x", pins=[Pin(identity("draft"), years(None, None))])
+    certified.contexts.create("old", OWNER, "x", pins=[pin("draft", years(None, None))])
     certified.contexts.set_default("old", OWNER, "x")
     at = seconds("2020-06-01")
     for context, name in ((None, "draft"), ("old", "draft"), ("now", "a")):
@@ -212,7 +221,7 @@ def test_images_without_a_time_or_a_name(certified: Catalogue) -> None:
 
 def test_a_deconvolution_in_a_context_uses_no_psf_outside_it(certified: Catalogue) -> None:
     certified.add(psf("other", channel="304"))
-    certified.contexts.create("other", OWNER, "x", pins=[Pin(identity("other"))])
+    certified.contexts.create("other", OWNER, "x", pins=[pin("other")])
     refused("no-psf-fits", lambda: picked_for_image(certified, header(), OWNER, "other"))
     certified.contexts.set_default("other", OWNER, "x")
     refused("no-psf-fits", lambda: picked_for_image(certified, header(), OWNER, None))

@@ -11,10 +11,11 @@ import pytest
 
 from psfcore.errors import DataError
 from tests.workers.databases import BOTH
-from tests.workers.psf_examples import OWNER, certify, deprecate, identity, psf, refused, years
+from tests.workers.psf_examples import OWNER, between, certify, deprecate, identity, psf, refused, years
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.psfs import PsfFilter, StatusAsked
+from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import PsfRow
+from workers.contract.psf_status import StatusChange
 from workers.versions import PsfStatus, seconds
 
 
@@ -62,7 +63,7 @@ def test_other_series_and_owners_have_ranges_of_their_own(three: Catalogue) -> N
     certify(three, "a", "1.0.0")
     certify(three, "other channel", "1.0.0")
     certify(three, "other kind", "1.0.0")
-    asked = StatusAsked(PsfStatus.CERTIFIED, "", version="1.0.0")
+    asked = StatusChange(status=PsfStatus.CERTIFIED, reason="", version="1.0.0")
     assert three.psfs.change(identity("a"), "somebody", asked, "x").status == "certified"
     refused("no-such-psf", lambda: three.psfs.change(identity("b"), "somebody", asked, "x"))
 
@@ -77,20 +78,22 @@ def test_a_version_is_given_once_and_never_again(three: Catalogue) -> None:
 
 def test_a_certified_psf_gets_another_range_and_keeps_its_version(three: Catalogue) -> None:
     certify(three, "a", "1.0.0", years(2020, None))
-    again = StatusAsked(PsfStatus.CERTIFIED, "ends", validity=years(2020, 2022))
+    again = StatusChange(status=PsfStatus.CERTIFIED, reason="ends", **between(years(2020, 2022)))
     row = three.psfs.change(identity("a"), OWNER, again, "tester")
     assert (row.version, row.valid_to) == ("1.0.0", seconds("2022-01-01"))
-    row = three.psfs.change(identity("a"), OWNER, StatusAsked(PsfStatus.CERTIFIED, "as it is"), "tester")
+    row = three.psfs.change(
+        identity("a"), OWNER, StatusChange(status=PsfStatus.CERTIFIED, reason="as it is"), "tester"
+    )
     assert row.valid_to == seconds("2022-01-01"), "a range that is not spoken of stays"
     assert len(three.psfs.changes(identity("a"), OWNER)) == 3
-    other = StatusAsked(PsfStatus.CERTIFIED, "", version="2.0.0")
+    other = StatusChange(status=PsfStatus.CERTIFIED, reason="", version="2.0.0")
     refused("not-of-this-change", lambda: three.psfs.change(identity("a"), OWNER, other, "tester"))
 
 
 def test_a_psf_supersedes_others_in_one_step(three: Catalogue) -> None:
     certify(three, "a", "1.0.0", years(2020, 2021))
     certify(three, "b", "1.1.0", years(2021, None))
-    asked = (identity("a"), identity("b"))
+    asked = [identity("a"), identity("b")]
     certify(three, "c", "2.0.0", years(2020, None), supersedes=asked)
     for name in ("a", "b"):
         row = three.get(PsfRow, identity(name), OWNER)
@@ -103,7 +106,7 @@ def test_an_invalid_supersession_changes_nothing(three: Catalogue) -> None:
     three.add(psf("far", channel="304"))
     certify(three, "far", "1.0.0")
     for others in (("b",), ("c",), ("far",), ("a", "nobody")):
-        asked = tuple(map(identity, others))
+        asked = [*map(identity, others)]
         refused("not-to-supersede", lambda asked=asked: certify(three, "c", "2.0.0", supersedes=asked))
     statuses = [status(three, name) for name in ("a", "c", "far")]
     assert statuses == ["certified", "draft", "certified"]
@@ -129,12 +132,14 @@ def test_wrong_transitions_change_nothing(three: Catalogue) -> None:
     certify(three, "a", "1.0.0")
     deprecate(three, "a")
     refused("wrong-transition", lambda: certify(three, "a", "1.1.0"))
-    back = StatusAsked(PsfStatus.DRAFT, "")
+    back = StatusChange(status=PsfStatus.DRAFT, reason="")
     refused("wrong-transition", lambda: three.psfs.change(identity("a"), OWNER, back, "x"))
-    with_version = StatusAsked(PsfStatus.DEPRECATED, "", version="1.0.0")
+    with_version = StatusChange(status=PsfStatus.DEPRECATED, reason="", version="1.0.0")
     certify(three, "b", "1.1.0")
     refused("not-of-this-change", lambda: three.psfs.change(identity("b"), OWNER, with_version, "x"))
-    with_successor = StatusAsked(PsfStatus.CERTIFIED, "", version="1.0.0", successor_id=identity("b"))
+    with_successor = StatusChange(
+        status=PsfStatus.CERTIFIED, reason="", version="1.0.0", successor=identity("b")
+    )
     refused("not-of-this-change", lambda: three.psfs.change(identity("c"), OWNER, with_successor, "x"))
 
 

@@ -21,13 +21,13 @@ from tests.whole.stack import Missing, postgres_database
 from tests.workers.databases import change, database, rows
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.schema import REVISIONS, Schema, SchemaError
-from workers.catalogue.tables import Base, WorkerRow
+from workers.catalogue.tables import Base, JobRow, WorkerRow
 from workers.settings import Settings
 
 LATER = """
 import sqlalchemy as sa
 from alembic import op
-revision, down_revision = "0021", "0020"
+revision, down_revision = "0022", "0021"
 def upgrade():
     op.add_column("workers", sa.Column("host", sa.String, server_default="-here"))
 """
@@ -95,10 +95,10 @@ def test_an_older_database_is_upgraded_with_its_data(
     worker = {"name": "w", "started_at": 1.0, "heartbeat_at": 2.0, "version": "0.1.0"}
     change(catalogue, insert(WorkerRow).values(worker))
     shutil.copytree(REVISIONS, tmp_path / "later")
-    (tmp_path / "later" / "versions" / "r0021_later.py").write_text(LATER)
+    (tmp_path / "later" / "versions" / "r0022_later.py").write_text(LATER)
     later = Schema(database(catalogue), tmp_path / "later")
     assert later.status().state == "older"
-    with pytest.raises(SchemaError, match=r"at revision 0021.*it is at revision 0020.*database upgrade"):
+    with pytest.raises(SchemaError, match=r"at revision 0022.*it is at revision 0021.*database upgrade"):
         later.check()
     caplog.set_level(logging.INFO, "workers.catalogue.schema")
     caplog.clear()
@@ -106,7 +106,7 @@ def test_an_older_database_is_upgraded_with_its_data(
     assert later.upgrade() is None
     assert later.status().state == "current" and catalogue.schema.status().state == "newer"
     [line] = said(caplog)
-    assert line.startswith("database: upgraded from 0020 to 0021")
+    assert line.startswith("database: upgraded from 0021 to 0022")
     if database(catalogue).sqlite:
         assert copy is not None and line.endswith(str(copy)) and copy.stat().st_mode & 0o777 == 0o600
         old = Catalogue(f"sqlite:///{copy}")
@@ -118,11 +118,29 @@ def test_an_older_database_is_upgraded_with_its_data(
     assert rows(catalogue, text("SELECT name || host FROM workers")) == ["w-here"]
 
 
+def test_the_rows_of_revision_0020_get_the_time_of_their_last_change(catalogue: Catalogue) -> None:
+    catalogue.upgrade()
+    row = {"owner": "o", "kind": "psf-build", "parameters": {}, "phase": "COMPLETED", "created_at": 1.0}
+    jobs = [row | {"id": str(end), "request_key": str(end), "ended_at": end} for end in (None, 2.0)]
+    change(catalogue, *(insert(JobRow).values(**one) for one in jobs))
+    for table in ("jobs", "bulks"):
+        before = (
+            f"DROP INDEX {table}_changed",
+            f"ALTER TABLE {table} DROP COLUMN changed_at",
+            f"CREATE INDEX {table}_ended ON {table} (owner, ended_at, id)",
+        )
+        change(catalogue, *map(text, before))
+    change(catalogue, text("UPDATE alembic_version SET version_num = '0020'"))
+    catalogue.upgrade()
+    assert catalogue.schema.status().state == "current" and differences(catalogue) == []
+    assert rows(catalogue, text("SELECT changed_at FROM jobs ORDER BY changed_at")) == [1.0, 2.0]
+
+
 @sqlite_alone
 def test_a_database_that_cannot_be_copied_is_not_upgraded(catalogue: Catalogue, tmp_path: Path) -> None:
     catalogue.upgrade()
     shutil.copytree(REVISIONS, tmp_path / "later")
-    (tmp_path / "later" / "versions" / "r0021_later.py").write_text(LATER)
+    (tmp_path / "later" / "versions" / "r0022_later.py").write_text(LATER)
     later = Schema(database(catalogue), tmp_path / "later")
     before = {file.name for file in tmp_path.iterdir()}
 

@@ -19,15 +19,14 @@ from tests.in_process import InProcess
 from tests.workers.psf_examples import OWNER, certify, deprecate, identity, psf, refused
 from workers.bulk.image import statistics_of
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.contexts import Pin
-from workers.catalogue.psfs import StatusAsked
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, TransitRow
 from workers.contract.identities import psf_identity
 from workers.contract.kinds import JobRequest, Kind, Result
+from workers.contract.psf_status import Pin, StatusChange
 from workers.contract.requests import Parameters, PsfBuild, PsfFit, ResolvedDeconvolve
 from workers.intake import requests
 from workers.intake.compatibility import check, details_now, suits
-from workers.intake.requests import Asked, resolve_by_ids
+from workers.intake.requests import Submission, resolve_by_ids
 from workers.intake.uploads import image_row, uploaded_psf_row
 from workers.versions import PsfStatus
 
@@ -126,7 +125,7 @@ def test_pixels_of_another_size_are_refused_with_the_factor_that_helps(tmp_path:
 
 
 def change(catalogue: Catalogue, status: PsfStatus, reason: str = "", **more: Any) -> None:
-    catalogue.psfs.change(BUILT, OWNER, StatusAsked(status, reason, **more), "tester")
+    catalogue.psfs.change(BUILT, OWNER, StatusChange(status=status, reason=reason, **more), "tester")
 
 
 @pytest.fixture
@@ -151,7 +150,7 @@ def test_a_deprecated_psf_is_not_chosen(local: InProcess, catalogue: Catalogue, 
     assert "hri_euv" in message and "reason: wrong mesh" in message and f"--psf {BUILT[:12]}" in message
     catalogue.add(psf("better"))
     certify(catalogue, "better", "2.0.0")
-    change(catalogue, PsfStatus.DEPRECATED, successor_id=identity("better"))
+    change(catalogue, PsfStatus.DEPRECATED, successor=identity("better"))
     deprecate(catalogue, "better")
     assert f"its successor is {identity('better')[:12]}" in refused("psf-deprecated", deconvolve)
 
@@ -174,7 +173,7 @@ def test_a_named_deprecated_psf_is_warned_of(local: InProcess, catalogue: Catalo
 
 
 def test_an_earlier_context_still_chooses_it(local: InProcess, catalogue: Catalogue, tmp_path: Path) -> None:
-    catalogue.contexts.create("old", OWNER, "tester", pins=[Pin(BUILT)])
+    catalogue.contexts.create("old", OWNER, "tester", pins=[Pin(psf_id=BUILT)])
     change(catalogue, PsfStatus.DEPRECATED)
     product = local.deconvolve(tmp_path / "i.fits", context="old", **FEW)
     assert product["psf_id"] == BUILT
@@ -196,7 +195,9 @@ def test_a_fit_does_not_choose_a_diffraction_psf_that_was_deprecated(catalogue: 
     )
     assert requests.resolve(asked, catalogue, OWNER)[0]["diffraction_recipe"] is not None
     for status, version in ((PsfStatus.CERTIFIED, "1.0.0"), (PsfStatus.DEPRECATED, None)):
-        catalogue.psfs.change(row.id, OWNER, StatusAsked(status, "blurred", version=version), "tester")
+        catalogue.psfs.change(
+            row.id, OWNER, StatusChange(status=status, reason="blurred", version=version), "tester"
+        )
     assert "known_psf" in refused("psf-deprecated", lambda: requests.resolve(asked, catalogue, OWNER))
 
 
@@ -217,7 +218,7 @@ class Two(Parameters):
 
 def resolved(catalogue: Catalogue, **parameters: str) -> Parameters:
     kind = Kind("two", task="", result=Result.REPORT, parameters=Two, resolved=Two)
-    return resolve_by_ids(Asked(kind, Two(**parameters), catalogue, OWNER, ()))
+    return resolve_by_ids(Submission(kind, Two(**parameters), catalogue, OWNER, ()))
 
 
 def test_every_id_is_checked(catalogue: Catalogue) -> None:

@@ -15,9 +15,18 @@ from psfcore.errors import DataError
 from psfcore.instruments.files import instrument_names
 from tests.conftest import write_image, write_psf
 from tests.in_process import InProcess
-from tests.workers.psf_examples import OWNER, certify, deprecate, header_of, identity, psf, refused, years
+from tests.workers.psf_examples import (
+    OWNER,
+    certify,
+    deprecate,
+    header_of,
+    identity,
+    pin,
+    psf,
+    refused,
+    years,
+)
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.contexts import Pin
 from workers.catalogue.tables import PsfRow
 from workers.contract.identities import interpolated_psf_identity
 from workers.contract.requests import Deconvolve, PsfInterpolate
@@ -136,13 +145,13 @@ def test_a_context_keeps_whether_a_series_is_interpolated(certified: Catalogue) 
     assert interpolation(certified, "2021-06-01", "now") is None
     certified.contexts.set_default("always", OWNER, "x")
     assert interpolation(certified, "2021-06-01") == before
-    same, new = certified.contexts.create("never", OWNER, "x", pins=[Pin(identity(n)) for n in "abc"])
+    same, new = certified.contexts.create("never", OWNER, "x", pins=[pin(n) for n in "abc"])
     assert not new and same.id == never.id
 
 
 def test_a_context_interpolates_between_the_ranges_of_its_pins(certified: Catalogue) -> None:
     allow(certified)
-    pins = [Pin(identity("a"), years(2019, 2020)), Pin(identity("c"))]
+    pins = [pin("a", years(2019, 2020)), pin("c")]
     certified.contexts.create("mine", OWNER, "x", pins=pins)
     found = interpolation(certified, "2022-06-01", "mine")
     assert found is not None
@@ -254,7 +263,7 @@ def test_a_variant_has_its_own_versions_ranges_and_interpolation(variants: Catal
 
 
 def test_a_context_chooses_among_its_own_variants(variants: Catalogue) -> None:
-    variants.contexts.create("plain", OWNER, "x", pins=[Pin(identity("plain"))])
+    variants.contexts.create("plain", OWNER, "x", pins=[pin("plain")])
     variants.contexts.create("all", OWNER, "x")
     assert chosen(variants, image("Open 2"), "plain") == "plain"
     assert chosen(variants, image("Open 2"), "all") == "open_2"

@@ -11,7 +11,7 @@ from sqlalchemy import update
 
 from tests.workers.databases import BOTH, change
 from tests.workers.jobs import job_row
-from workers.catalogue import waiting
+from workers.catalogue import turns
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
 from workers.catalogue.tables import JobRow
@@ -224,7 +224,7 @@ def test_a_new_job_has_the_place_that_it_is_told_beforehand(catalogue: Catalogue
 
 
 def test_no_more_than_the_limit_is_counted(catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(waiting, "MOST_COUNTED", 3)
+    monkeypatch.setattr(turns, "MOST_COUNTED", 3)
     jobs = submitted(catalogue, "ann", 6)
     assert [before(catalogue, job) for job in jobs] == [0, 1, 2, 3, 3, 3]
     assert catalogue.places.before_new("bob", Queue.BULK) == 3

@@ -51,7 +51,9 @@ class Turns:
         # not submitted.
         blocked = [JobRow.phase == Phase.QUEUED, JobRow.queue == queue, ~no_equal_at_work()]
         received = JobRow.submitted_at.is_not(None)
-        self._database.change(update(JobRow).where(*blocked, received).values(submitted_at=None))
+        self._database.change(
+            update(JobRow).where(*blocked, received).values(submitted_at=None, changed_at=JobRow.changed_at)
+        )
         return None
 
     def leave_next(self, told_id: str, queue: Queue) -> str | None:
