@@ -8,7 +8,7 @@ DIR/cases/NNNN/bound.json     what a Bayes observer could know (gap-bound/1)
 DIR/cases/NNNN/run.json       time and memory of the diagnosis, and the reason if it gave no report
 DIR/truth/NNNN.json           salt and truth
 DIR/seals.jsonl               one line for each case: {"case", "sha256"}
-DIR/score.json, .txt, .png    the score as JSON, as a table and as a picture; each run writes them again
+DIR/score.json, score.txt     the score as JSON and as a table; each run writes them again
 """
 
 from __future__ import annotations
@@ -155,7 +155,7 @@ def make_set(
     made = BlindSet(folder)
     _remember(made, plan, scenes)
     (folder / "truth").mkdir(parents=True, exist_ok=True)
-    missing = [number for number in plan.numbers if not made.is_made(number)]
+    missing = [number for number in range(plan.cases) if not made.is_made(number)]
     for number in missing:
         draw_case(plan, number)
     not_made: dict[int, str] = {}
@@ -221,7 +221,7 @@ def _remember(made: BlindSet, plan: SetPlan, scenes: Sequence[Plane]) -> None:
     about, file = json.loads(json.dumps(asdict(plan) | own)), made.folder / "set.json"
     if file.is_file():
         before = json.loads(file.read_text("utf-8"))
-        if before | {"cases": plan.cases} != about:
+        if any(before.get(key) != value for key, value in about.items() if key != "cases"):
             raise DataError(
                 "other-set",
                 f"expected an empty folder, or a set that was made with {about}; {made.folder} contains a set that "

@@ -249,7 +249,7 @@ def test_a_case_that_fails_is_named_and_the_others_are_made(
     said: list[str] = []
     made, not_made = make_set(tmp_path, plan, progress=said.append)
     assert not_made == {1: "bad-scene: expected light in the scene"}
-    assert [made.is_made(number) for number in plan.numbers] == [True, False, True]
+    assert [made.is_made(number) for number in range(3)] == [True, False, True]
     assert sum("could not make case 0001" in line for line in said) == 1
     failing.clear()
     # The next run tries again. A last seal that a power failure cut is ignored and removed.

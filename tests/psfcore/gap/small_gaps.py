@@ -10,7 +10,7 @@ from unittest.mock import patch
 
 import numpy as np
 
-from psfcore.blind.leftover import true_coordinates
+from psfcore.blind.residuals import true_coordinates
 from psfcore.gap import corrected_psf
 from psfcore.gap.diagnose import Diagnosis, diagnose
 from psfcore.gap.effect import Effect
