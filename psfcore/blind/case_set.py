@@ -115,8 +115,8 @@ class BlindSet:
         """The truth of a case, after its seal was checked. Raises DataError "broken-seal", "bad-seals"."""
         seal = self.seals().get(number)
         try:
-            kept = json.loads(self.truth_file(number).read_text("utf-8"))
-            salt, truth = str(kept["salt"]), dict(kept["truth"])
+            content = json.loads(self.truth_file(number).read_text("utf-8"))
+            salt, truth = str(content["salt"]), dict(content["truth"])
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise DataError(
                 "broken-seal", f"case {number:04d}: expected salt and truth; got {error!s:.100}"

@@ -24,10 +24,10 @@ from psfcore.errors import DataError
 from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.columns import FieldShape, with_effect
 from psfcore.gap.evidence.effect_fits import EffectFit, fit_effects, label_of, p_value_of_gap
-from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.expected_gap import ExpectedGap, linear_model_of
 from psfcore.gap.evidence.linear_model import LinearModel
 from psfcore.gap.evidence.measured_noise import MeasuredNoise, measured_noise
+from psfcore.gap.evidence.responses import Evidence
 from psfcore.gap.library.registry import LIBRARY
 from psfcore.gap.library.scene import MOST_POINTINGS
 from psfcore.gap.verdict.answer import LEAST_IMAGES, Answer, answer_of
@@ -228,8 +228,8 @@ def _told(model: LinearModel, answer: Answer) -> EffectFit | None:
     model = replace(model, evidence=evidence)
     effects = [effect for effect in evidence.effects if effect.name in names]
     fit = fit_effects(model, effects)
-    kept = set(fit.step.columns)
-    if all(kept.intersection(evidence.columns[effect.name]) for effect in effects):
+    columns = set(fit.step.columns)
+    if all(columns.intersection(evidence.columns[effect.name]) for effect in effects):
         return fit
     return fit_effects(model, effects, any_sign=True)
 

@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING
 from psfcore.errors import DataError
 from psfcore.fits.psfs import read_psf
 from psfcore.scatter.inversion import ALGORITHM_VERSION, invert
-from psfcore.scatter.kept import read_solution, write_solution
 from psfcore.scatter.reconstruction import Progress, Solution
 from psfcore.scatter.shapes import Shape, Vector
+from psfcore.scatter.solution_file import read_solution, write_solution
 from psfcore.transit.folder import read_prepared
 from psfcore.transit.prepare import Prepared
 from psfcore.transit.transit import Kernel, Transit

@@ -18,8 +18,8 @@ from psfcore.gap.evidence.columns import (
     FieldColumns,
     with_effect,
 )
-from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
+from psfcore.gap.evidence.responses import Evidence
 from psfcore.gap.evidence.tree import Field, fields_of
 from psfcore.gap.evidence.unocculted_blocks import blocks
 from psfcore.gap.verdict.answer import answer_of

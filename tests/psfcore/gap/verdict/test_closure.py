@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
+from psfcore.gap.evidence.responses import Evidence
 from psfcore.gap.verdict.closure import FORM_ERROR, HeldOut, closure, fall, gap, hold_out, time_blocks
 from psfcore.gap.verdict.where import shapley, where
 from tests.psfcore.gap.linear_models import discs_only, with_left, with_residuals

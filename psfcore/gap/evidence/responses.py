@@ -233,28 +233,28 @@ def residuals_at(
     the columns after the base that are kept; changes: the changes that belong to them, for discs whose cells have moved.
     The result has no effects. Discs that `evidence` lacks are left out.
     """
-    kept = [*evidence.base, *columns]
+    rows = [*evidence.base, *columns]
     part = set(view.solution.part)
-    unocculted = unocculted_blocks(view, len(kept), progress)
-    unocculted.errors[:] = evidence.unocculted.errors[kept]
+    unocculted = unocculted_blocks(view, len(rows), progress)
+    unocculted.errors[:] = evidence.unocculted.errors[rows]
     return replace(
         evidence,
         effects=(),
         columns={},
         untestable={},
-        discs=tuple(_disc_at(view, disc, kept, changes) for disc in evidence.discs if disc.index in part),
+        discs=tuple(_disc_at(view, disc, rows, changes) for disc in evidence.discs if disc.index in part),
         unocculted=unocculted,
     )
 
 
-def _disc_at(view: View, disc: DiscCells, kept: Sequence[int], changes: Sequence[Change]) -> DiscCells:
+def _disc_at(view: View, disc: DiscCells, rows: Sequence[int], changes: Sequence[Change]) -> DiscCells:
     other = view.solution
     place = other.sky.found[disc.index].place
     cells = cells_of(other.sky.dark[disc.index], place.x_px, place.y_px)
     if cells.pixels.size != disc.pixels.size:  # its outermost dark pixels moved
         return disc_with_jacobian(view, disc.index, changes)
     residual, expected = other.residual(disc.index)
-    jacobian = disc.jacobian[list(kept)]
+    jacobian = disc.jacobian[list(rows)]
     for k, slope in enumerate(view.slopes):
         jacobian[k] = cells.weights @ other.jacobian(disc.index, slope)
     return replace(
