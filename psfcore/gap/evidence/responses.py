@@ -162,7 +162,7 @@ def gather(
         if n in part:
             discs.append(disc_with_jacobian(view, n, changes))
             dark = solution.sky.dark[n]
-            far = moved.field(moved.convolve(view.occulted_scene(n)))[dark].mean()
+            far = moved.field(moved.convolve(view.occulted_scenes[n]))[dark].mean()
             light = max(float(view.expected[n][dark].mean()), 1e-9)
             info = replace(info, scattering_distance_px=float(far / light))
         infos.append(info)
@@ -205,7 +205,7 @@ def disc_with_jacobian(view: View, n: int, changes: Sequence[Change]) -> DiscCel
     solution = view.solution
     cells, planes = disc_cells(solution, n)
     flat = planes.reshape(planes.shape[0], -1)
-    scene = view.occulted_scene(n)
+    scene = view.occulted_scenes[n]
     slopes = (slope.field(slope.convolve(scene)) for slope in view.slopes)
     fields = itertools.chain(slopes, (change.change(n, view.expected) for change in changes))
     jacobian = np.zeros((len(view.slopes) + len(changes), flat.shape[0]))
