@@ -81,8 +81,7 @@ class BlindSet:
         if not self.seals_file.is_file():
             return {}
         found: dict[int, str] = {}
-        # If the last line has no line end, a power failure cut the line. The case of this line is made again.
-        for line in self.seals_file.read_text("utf-8").rpartition("\n")[0].splitlines():
+        for line in self.seals_file.read_text("utf-8").splitlines():
             try:
                 entry = json.loads(line)
                 number, seal = int(entry["case"]), str(entry["sha256"])
@@ -106,10 +105,9 @@ class BlindSet:
         return _seal_of(salt, truth)
 
     def keep_seal(self, number: int, seal: str) -> None:
-        """Add the seal of a case to the seals. A last line that a power failure cut is removed."""
+        """Add the seal of a case to the seals, which are replaced as a whole."""
         text = self.seals_file.read_text("utf-8") if self.seals_file.is_file() else ""
-        line = json.dumps({"case": number, "sha256": seal}) + "\n"
-        write_whole(self.seals_file, "".join(text.rpartition("\n")[:2]) + line)
+        write_whole(self.seals_file, text + json.dumps({"case": number, "sha256": seal}) + "\n")
 
     def truth(self, number: int) -> dict[str, Any]:
         """The truth of a case, after its seal was checked. Raises DataError "broken-seal", "bad-seals"."""
