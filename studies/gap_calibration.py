@@ -66,10 +66,10 @@ def main(output: Path, cases: int, seed: int, processes: int, write: bool) -> No
         print(line, file=sys.stderr, flush=True)
 
     plan = SetPlan(cases, seed, withheld=CALIBRATION)
-    made, not_made = make_set(output, plan, processes=processes, progress=say)
+    blind_set, not_made = make_set(output, plan, processes=processes, progress=say)
     numbers = [number for number in range(cases) if number not in not_made]
-    run_set(made, numbers, DIAGNOSE, processes=processes, progress=say)
-    diagnosed, _ = diagnosed_cases(made, numbers)
+    run_set(blind_set, numbers, DIAGNOSE, processes=processes, progress=say)
+    diagnosed, _ = diagnosed_cases(blind_set, numbers)
     found = [smallest_level(case.report, case.truth) for case in diagnosed if case.causes]
     levels = sorted(level for level in found if level is not None)
     command = f"python -m studies.gap_calibration --cases {cases} --seed {seed} --write"

@@ -251,18 +251,20 @@ def true_closure(truth: Mapping[str, Any]) -> float | None:
     return float(1 - without_effect / with_effect) if with_effect else None
 
 
-def diagnosed_cases(made: BlindSet, numbers: Sequence[int]) -> tuple[list[DiagnosedCase], dict[int, str]]:
+def diagnosed_cases(
+    blind_set: BlindSet, numbers: Sequence[int]
+) -> tuple[list[DiagnosedCase], dict[int, str]]:
     """Two results: the cases that have a report; the reasons why the other cases have none, by number.
 
     Each truth is read, and its seal is checked. Raises DataError "broken-seal", "bad-seals".
     """
     cases, failures = [], {}
     for number in numbers:
-        truth, run = made.truth(number), run_of(made, number)
-        report = result_in(made.report(number), REPORT_SCHEMA)
+        truth, run = blind_set.truth(number), run_of(blind_set, number)
+        report = result_in(blind_set.report(number), REPORT_SCHEMA)
         if report is None:
             failures[number] = (run.error if run else "") or "no complete report"
         else:
-            bound = result_in(made.bound(number), BOUND_SCHEMA)
+            bound = result_in(blind_set.bound(number), BOUND_SCHEMA)
             cases.append(DiagnosedCase(number, truth, report, run.wall_s if run else 0.0, bound))
     return cases, failures

@@ -48,7 +48,7 @@ class Run:
 
 
 def run_set(
-    made: BlindSet,
+    blind_set: BlindSet,
     numbers: Sequence[int],
     diagnosis: Sequence[str],
     *,
@@ -68,7 +68,7 @@ def run_set(
     seal.
     """
     for number in numbers:
-        if not made.is_made(number):
+        if not blind_set.is_made(number):
             raise DataError(
                 "not-sealed",
                 f"case {number:04d}: expected a truth that was sealed before the diagnosis; got no seal: make the "
@@ -89,19 +89,19 @@ def run_set(
         return run
 
     def one(number: int) -> Run | None:
-        run = result(number, diagnosis, made.transit(number), made.report(number), REPORT_SCHEMA)
+        run = result(number, diagnosis, blind_set.transit(number), blind_set.report(number), REPORT_SCHEMA)
         if run is not None:
-            write_whole(made.case_folder(number) / "run.json", json.dumps(asdict(run), indent=1))
-        result(number, bound, made.expected(number), made.bound(number), BOUND_SCHEMA)
+            write_whole(blind_set.case_folder(number) / "run.json", json.dumps(asdict(run), indent=1))
+        result(number, bound, blind_set.expected(number), blind_set.bound(number), BOUND_SCHEMA)
         return run
 
     with ThreadPoolExecutor(max(1, processes)) as pool:
         return [run for run in pool.map(one, numbers) if run is not None]
 
 
-def run_of(made: BlindSet, number: int) -> Run | None:
+def run_of(blind_set: BlindSet, number: int) -> Run | None:
     """The last diagnosis of a case; None if there was none."""
-    file = made.case_folder(number) / "run.json"
+    file = blind_set.case_folder(number) / "run.json"
     return Run(**json.loads(file.read_text("utf-8"))) if file.is_file() else None
 
 

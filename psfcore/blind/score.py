@@ -178,14 +178,14 @@ def table(found: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def write_score(made: BlindSet, numbers: Sequence[int], not_made: Mapping[int, str]) -> str:
+def write_score(blind_set: BlindSet, numbers: Sequence[int], not_made: Mapping[int, str]) -> str:
     """Open the seals of a diagnosed set, judge its cases, and write score.json and score.txt into its folder.
 
     numbers: the cases to score. not_made: the reason for each case that could not be made. Returns the table as text.
     """
-    cases, failures = diagnosed_cases(made, numbers)
+    cases, failures = diagnosed_cases(blind_set, numbers)
     found = score(cases, dict(not_made) | failures)
     text = table(found)
-    (made.folder / "score.json").write_text(json.dumps(found, indent=1, allow_nan=False), "utf-8")
-    (made.folder / "score.txt").write_text(text + "\n", "utf-8")
+    (blind_set.folder / "score.json").write_text(json.dumps(found, indent=1, allow_nan=False), "utf-8")
+    (blind_set.folder / "score.txt").write_text(text + "\n", "utf-8")
     return text

@@ -308,7 +308,7 @@ def blind(
     with user_errors(), alone_in(output):
         plan = SetPlan(cases, seed, size, images, only, clean_only, not synthetic, left_pct)
         planes = [image_rate(file, limits()) for file in scenes]
-        made, not_made = make_set(output, plan, scenes=planes, processes=processes, progress=say)
+        blind_set, not_made = make_set(output, plan, scenes=planes, processes=processes, progress=say)
         numbers = [number for number in range(cases) if number not in not_made]
         if not numbers:
             why = next(iter(not_made.values()))
@@ -318,8 +318,8 @@ def blind(
         if make_only:
             echo(f"{output}: {len(numbers)} of {cases} cases made and sealed")
             return
-        run_set(made, numbers, DIAGNOSE, bound=BOUND, processes=processes, keep=keep, progress=say)
-        echo(write_score(made, numbers, not_made))
+        run_set(blind_set, numbers, DIAGNOSE, bound=BOUND, processes=processes, keep=keep, progress=say)
+        echo(write_score(blind_set, numbers, not_made))
 
 
 # --- a planned transit ----------------------------------------------------------------------------------
