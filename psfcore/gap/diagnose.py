@@ -31,6 +31,7 @@ from psfcore.gap.evidence.responses import Evidence
 from psfcore.gap.library.registry import LIBRARY
 from psfcore.gap.library.scene import MOST_POINTINGS
 from psfcore.gap.verdict.answer import LEAST_IMAGES, Answer, answer_of
+from psfcore.gap.verdict.axes import Axis, ranked_axes
 from psfcore.gap.verdict.calibration import COVERAGE, Calibration, shipped_calibration
 from psfcore.gap.verdict.closure import (
     HeldOut,
@@ -44,7 +45,6 @@ from psfcore.gap.verdict.closure import (
 )
 from psfcore.gap.verdict.correction import Corrected, add_to_model
 from psfcore.gap.verdict.limits import Limits, limits
-from psfcore.gap.verdict.where import Axis, where
 from psfcore.gap.view import View, return_unused_memory
 from psfcore.psf import Psf
 from psfcore.scatter.inversion import Inverter, solution_of
@@ -190,7 +190,9 @@ def diagnose(
         model=model,
         expected=expected,
         noise=noise,
-        where=where(model if told is None else told.model, rng, axes, None if told is None else told.step),
+        where=ranked_axes(
+            model if told is None else told.model, rng, axes, None if told is None else told.step
+        ),
         before_refit=rms if told is None else _before_refit(told, rng),
         rms=rms,
         after=rms if after is None else gap(after.residual_pct, after.noise_pct, rng),

@@ -60,7 +60,7 @@ class Axis:
         }
 
 
-def where(
+def ranked_axes(
     model: LinearModel, rng: np.random.Generator, favoured: Sequence[str] = (), explained: Step | None = None
 ) -> tuple[Axis, ...]:
     """All axes, the strongest first. Significant axes come before the others; then the share decides.
