@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -24,9 +24,10 @@ import numpy as np
 from psfcore.blind.case_set import make_set
 from psfcore.blind.cases import SetPlan
 from psfcore.blind.effects.effect import CALIBRATION
-from psfcore.blind.run_set import REPORT_SCHEMA, result_in, run_set
+from psfcore.blind.judge import diagnosed_cases
+from psfcore.blind.run_set import run_set
 from psfcore.gap.verdict import calibration
-from psfcore.gap.verdict.answer import Cause, Labels, causes_of
+from psfcore.gap.verdict.answer import Labels, causes_of
 from service.cli.transits import DIAGNOSE
 
 TRIED = (*np.linspace(0.3, 0.99, 70), 0.995)
@@ -37,27 +38,19 @@ HOLDS_FOR = (
 )
 
 
-def smallest_level(shares: Mapping[Labels, float], truth: Mapping[str, Any]) -> float | None:
-    """The smallest level at which the answer contains a true cause; None if no gap is detected. shares: of each set of labels."""
-    if not causes_of(shares, TRIED[0]):
-        return None
-    for level in TRIED:
-        if any(covers(cause, effect) for cause in causes_of(shares, level) for effect in truth["effects"]):
-            return float(level)
-    return MISSED
-
-
-def covers(cause: Cause, effect: Mapping[str, Any]) -> bool:
-    """Whether an alternative of a cause is the true effect, or has one of its families."""
-    return any(one.family.name in effect["families"] for one in cause.alternatives)
-
-
-def shares_of(report: Mapping[str, Any]) -> dict[Labels, float]:
-    """The probability of each set of labels in a report."""
-    return {
+def smallest_level(report: Mapping[str, Any], truth: Mapping[str, Any]) -> float | None:
+    """The smallest level at which the alternatives of a report contain a true cause; None if no gap is detected."""
+    shares: dict[Labels, float] = {
         frozenset((one["family"], one["effect"]) for one in row["causes"]): row["probability"]
         for row in report["hypotheses"]
     }
+    if not causes_of(shares, TRIED[0]):
+        return None
+    true = {family for effect in truth["effects"] for family in effect["families"]}
+    for level in TRIED:
+        if any(one.family.name in true for cause in causes_of(shares, level) for one in cause.alternatives):
+            return float(level)
+    return MISSED
 
 
 @click.command()
@@ -73,29 +66,19 @@ def main(output: Path, cases: int, seed: int, processes: int, write: bool) -> No
         print(line, file=sys.stderr, flush=True)
 
     plan = SetPlan(cases, seed, withheld=CALIBRATION)
-    made, not_made = make_set(output, plan, processes=processes, progress=say)
-    numbers = [number for number in plan.numbers if number not in not_made]
-    run_set(made, numbers, DIAGNOSE, processes=processes, progress=say)
-    levels = calibrated(
-        [
-            (report, made.truth(number))
-            for number in numbers
-            if (report := result_in(made.report(number), REPORT_SCHEMA)) is not None
-        ]
-    )
+    blind_set, not_made = make_set(output, plan, processes=processes, progress=say)
+    numbers = [number for number in range(cases) if number not in not_made]
+    run_set(blind_set, numbers, DIAGNOSE, processes=processes, progress=say)
+    diagnosed, _ = diagnosed_cases(blind_set, numbers)
+    found = [smallest_level(case.report, case.truth) for case in diagnosed if case.causes]
+    levels = sorted(level for level in found if level is not None)
     command = f"python -m studies.gap_calibration --cases {cases} --seed {seed} --write"
     about = {"seed": seed, "command": command, "version": version("heliopsf"), "holds_for": HOLDS_FOR}
-    found = calibration.Calibration(tuple(levels), about)
-    print(f"{len(levels)} cases; level {found.level():.3f}; missed {sum(one >= MISSED for one in levels)}")
+    level = calibration.Calibration(tuple(levels), about).level()
+    print(f"{len(levels)} cases; level {level:.3f}; missed {sum(one >= MISSED for one in levels)}")
     if write:
         file = Path(calibration.__file__).with_name(calibration.FILE)
         file.write_text(json.dumps({"about": about, "levels": levels}, indent=1) + "\n", "utf-8")
-
-
-def calibrated(cases: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]]) -> list[float]:
-    """The smallest levels, sorted. cases: the report and the truth of each."""
-    found = [smallest_level(shares_of(report), truth) for report, truth in cases if truth["effects"]]
-    return sorted(level for level in found if level is not None)
 
 
 if __name__ == "__main__":

@@ -114,7 +114,7 @@ FAULTS = (
           'value = 1 - float((chi2_after - nu).sum()) / total', 'value = 1 - float(chi2_after.sum()) / total'),
     Fault("gap-prior-of-each-form-undivided", "psfcore/gap/verdict/answer.py",
           '0.5 / alike[form.family, form.field is None] / len(families)', '0.5 / len(families)'),
-    Fault("blind-half-of-a-pair-counts", "psfcore/blind/judged.py",
+    Fault("blind-half-of-a-pair-counts", "psfcore/blind/judge.py",
           'if all(self.matches(one, level)', 'if any(self.matches(one, level)'),
     Fault("built-damaged-psf-used", "psfcore/psf_cache.py",
           'if sha256_of(path) == sha256:', 'if path.is_file():'),

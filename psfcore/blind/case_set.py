@@ -8,7 +8,7 @@ DIR/cases/NNNN/bound.json     what a Bayes observer could know (gap-bound/1)
 DIR/cases/NNNN/run.json       time and memory of the diagnosis, and the reason if it gave no report
 DIR/truth/NNNN.json           salt and truth
 DIR/seals.jsonl               one line for each case: {"case", "sha256"}
-DIR/score.json, .txt, .png    the score as JSON, as a table and as a picture; each run writes them again
+DIR/score.json, score.txt     the score as JSON and as a table; each run writes them again
 """
 
 from __future__ import annotations
@@ -81,8 +81,7 @@ class BlindSet:
         if not self.seals_file.is_file():
             return {}
         found: dict[int, str] = {}
-        # If the last line has no line end, a power failure cut the line. The case of this line is made again.
-        for line in self.seals_file.read_text("utf-8").rpartition("\n")[0].splitlines():
+        for line in self.seals_file.read_text("utf-8").splitlines():
             try:
                 entry = json.loads(line)
                 number, seal = int(entry["case"]), str(entry["sha256"])
@@ -106,17 +105,16 @@ class BlindSet:
         return _seal_of(salt, truth)
 
     def keep_seal(self, number: int, seal: str) -> None:
-        """Add the seal of a case to the seals. A last line that a power failure cut is removed."""
+        """Add the seal of a case to the seals, which are replaced as a whole."""
         text = self.seals_file.read_text("utf-8") if self.seals_file.is_file() else ""
-        line = json.dumps({"case": number, "sha256": seal}) + "\n"
-        write_whole(self.seals_file, "".join(text.rpartition("\n")[:2]) + line)
+        write_whole(self.seals_file, text + json.dumps({"case": number, "sha256": seal}) + "\n")
 
     def truth(self, number: int) -> dict[str, Any]:
         """The truth of a case, after its seal was checked. Raises DataError "broken-seal", "bad-seals"."""
         seal = self.seals().get(number)
         try:
-            kept = json.loads(self.truth_file(number).read_text("utf-8"))
-            salt, truth = str(kept["salt"]), dict(kept["truth"])
+            content = json.loads(self.truth_file(number).read_text("utf-8"))
+            salt, truth = str(content["salt"]), dict(content["truth"])
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise DataError(
                 "broken-seal", f"case {number:04d}: expected salt and truth; got {error!s:.100}"
@@ -152,52 +150,52 @@ def make_set(
     set that was made with another plan or other scenes, "bad-seals", and the errors of `draw_case`: all before the
     first case is made.
     """
-    made = BlindSet(folder)
-    _remember(made, plan, scenes)
+    blind_set = BlindSet(folder)
+    _remember(blind_set, plan, scenes)
     (folder / "truth").mkdir(parents=True, exist_ok=True)
-    missing = [number for number in plan.numbers if not made.is_made(number)]
+    missing = [number for number in range(plan.cases) if not blind_set.is_made(number)]
     for number in missing:
         draw_case(plan, number)
     not_made: dict[int, str] = {}
     for done, (number, seal, why_not, seconds) in enumerate(
-        _attempts(made, plan, missing, scenes, processes), 1
+        _attempts(blind_set, plan, missing, scenes, processes), 1
     ):
         so_far = f"in {seconds:.1f} s ({done} of {len(missing)})"
         if why_not:
             not_made[number] = why_not
             progress(f"could not make case {number:04d} {so_far}: {why_not}")
         else:
-            made.keep_seal(number, seal)
+            blind_set.keep_seal(number, seal)
             progress(f"made case {number:04d} {so_far}")
-    return made, not_made
+    return blind_set, not_made
 
 
 Attempt = tuple[int, str, str, float]  # number of the case; its seal, or why it could not be made; seconds
 
 
 def _attempts(
-    made: BlindSet, plan: SetPlan, numbers: Sequence[int], scenes: Sequence[Plane], processes: int
+    blind_set: BlindSet, plan: SetPlan, numbers: Sequence[int], scenes: Sequence[Plane], processes: int
 ) -> Iterator[Attempt]:
     """Make cases. The attempts are yielded in the order in which they end."""
     if processes <= 1 or len(numbers) <= 1:
-        yield from (_attempt(made, plan, number, scenes) for number in numbers)
+        yield from (_attempt(blind_set, plan, number, scenes) for number in numbers)
         return
     # With the start method "fork", the child processes would inherit locks that threads of this process hold.
     with ProcessPoolExecutor(
         processes, mp_context=get_context("spawn"), initializer=_end_with_parent
     ) as pool:
-        waiting = [pool.submit(_attempt, made, plan, number, scenes) for number in numbers]
+        waiting = [pool.submit(_attempt, blind_set, plan, number, scenes) for number in numbers]
         for future in as_completed(waiting):
             yield future.result()
 
 
-def _attempt(made: BlindSet, plan: SetPlan, number: int, scenes: Sequence[Plane]) -> Attempt:
+def _attempt(blind_set: BlindSet, plan: SetPlan, number: int, scenes: Sequence[Plane]) -> Attempt:
     started = time.perf_counter()
-    shutil.rmtree(made.case_folder(number), ignore_errors=True)  # an interrupted run may have left it
+    shutil.rmtree(blind_set.case_folder(number), ignore_errors=True)  # an interrupted run may have left it
     seal, why_not = "", ""
     try:
-        truth = make(draw_case(plan, number), made.transit(number), made.expected(number), scenes)
-        seal = made.keep_truth(number, truth)
+        truth = make(draw_case(plan, number), blind_set.transit(number), blind_set.expected(number), scenes)
+        seal = blind_set.keep_truth(number, truth)
     except DataError as error:
         why_not = f"{error.code}: {error.message}"
     return number, seal, why_not, time.perf_counter() - started
@@ -215,25 +213,27 @@ def _end_with_parent() -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
-def _remember(made: BlindSet, plan: SetPlan, scenes: Sequence[Plane]) -> None:
+def _remember(blind_set: BlindSet, plan: SetPlan, scenes: Sequence[Plane]) -> None:
     """Write the plan of the set; if the folder contains a set, check that it has the same plan."""
     own = {"scenes": [array_sha256(scene) for scene in scenes], "draw": DRAW}
-    about, file = json.loads(json.dumps(asdict(plan) | own)), made.folder / "set.json"
+    about, file = json.loads(json.dumps(asdict(plan) | own)), blind_set.folder / "set.json"
     if file.is_file():
         before = json.loads(file.read_text("utf-8"))
-        if before | {"cases": plan.cases} != about:
+        if any(before.get(key) != value for key, value in about.items() if key != "cases"):
             raise DataError(
                 "other-set",
-                f"expected an empty folder, or a set that was made with {about}; {made.folder} contains a set that "
+                f"expected an empty folder, or a set that was made with {about}; {blind_set.folder} contains a set that "
                 f"was made with {before}. Choose another folder",
             )
-    elif made.folder.is_dir() and (others := {path.name for path in made.folder.iterdir()} - {LOCK}):
+    elif blind_set.folder.is_dir() and (
+        others := {path.name for path in blind_set.folder.iterdir()} - {LOCK}
+    ):
         raise DataError(
             "other-set",
-            f"expected an empty folder, or the folder of a set; {made.folder} contains other files, such as "
+            f"expected an empty folder, or the folder of a set; {blind_set.folder} contains other files, such as "
             f"{min(others)}, which a set could replace. Choose another folder",
         )
-    made.folder.mkdir(parents=True, exist_ok=True)
+    blind_set.folder.mkdir(parents=True, exist_ok=True)
     write_whole(file, json.dumps(about, indent=1) + "\n")
 
 

@@ -61,8 +61,7 @@ _KIND_STREAM, _TRUTH_STREAM, _EFFECT_STREAM = 1, 2, 3
 class SetPlan:
     """The plan of a set.
 
-    cases: number of cases. size_px, images: of each transit. first: the number of the first case. only: names of
-    effects; every case has one of them, in turn. clean_only: no case has an effect. built_diffraction: True: half of
+    cases: number of cases. size_px, images: of each transit. only: names of effects; every case has one of them, in turn. clean_only: no case has an effect. built_diffraction: True: half of
     the cases have the diffraction PSF of the instrument, and half a synthetic one. False: all have a synthetic one.
     left_pct: the residuals (percent) that an effect should leave in the discs after a refit. The values are used in
     turn, each for all names of `only`. Empty: the residuals are drawn at random; for the names of `only` from
@@ -73,17 +72,11 @@ class SetPlan:
     seed: int
     size_px: int = 256
     images: int = 18
-    first: int = 0
     only: tuple[str, ...] = ()
     clean_only: bool = False
     built_diffraction: bool = True
     left_pct: tuple[float, ...] = ()
     withheld: str = TEST
-
-    @property
-    def numbers(self) -> range:
-        """The numbers of the cases."""
-        return range(self.first, self.first + self.cases)
 
 
 @dataclass(frozen=True)

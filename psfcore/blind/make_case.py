@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, uniform_filter
 
 from psfcore.blind.cases import Case, case_scenes
-from psfcore.blind.chain import Chain, EffectFree
 from psfcore.blind.effects.effect import Effect, Plane
 from psfcore.blind.effects.fine_optics import binned_glass, fine_optics
-from psfcore.blind.leftover import LinearEstimator, refitted, rms
+from psfcore.blind.residuals import LinearEstimator, refitted, rms
+from psfcore.blind.simulation import EffectFree, Simulation
 from psfcore.simulate.plan import HIGH
 from psfcore.simulate.transit import reported_places, write_observation
 from psfcore.transit.prepare import Exposure, prepare
@@ -44,7 +44,7 @@ def make(case: Case, transit: Path, expected: Path, images: Sequence[Plane] = ()
     """
     plan, diffraction = case.plan, binned_glass(case.glass)
     effect_free = EffectFree(plan, fine_optics(case.law, case.glass, plan.size_px), case_scenes(case, images))
-    clean = Chain(effect_free, (), case.seed, case.headroom)
+    clean = Simulation(effect_free, (), case.seed, case.headroom)
     estimator = LinearEstimator(_frames(clean), diffraction, case.law, plan.noise)
     targets = zip(case.effects, case.target_pct, strict=True)
     alone = [_at_target(effect, target, clean, estimator) for effect, target in targets]
@@ -59,10 +59,10 @@ def make(case: Case, transit: Path, expected: Path, images: Sequence[Plane] = ()
     effects = [_effect(one, left_pct, clean) for one, left_pct in alone]
     residuals = list[dict[str, float]]()
     if effects:
-        chains = {WITHOUT_EFFECTS: clean} | {f"effect_{n}": one for n, (one, _) in enumerate(alone)}
-        for name, chain in chains.items():
-            means = zip(chain.mean, plan.shots, strict=True)
-            write(expected / name, [rate * shot.exposure_s for rate, shot in means], chain.level)
+        simulations = {WITHOUT_EFFECTS: clean} | {f"effect_{n}": one for n, (one, _) in enumerate(alone)}
+        for name, simulation in simulations.items():
+            means = zip(simulation.mean, plan.shots, strict=True)
+            write(expected / name, [rate * shot.exposure_s for rate, shot in means], simulation.level)
         causes = [
             {
                 "folder": f"effect_{n}",
@@ -94,13 +94,13 @@ def make(case: Case, transit: Path, expected: Path, images: Sequence[Plane] = ()
     }
 
 
-def _effect(chain: Chain, left_pct: float, clean: Chain) -> dict[str, Any]:
-    """The entry of an effect in the truth. chain: the case with this effect alone."""
-    (effect,) = chain.effects
+def _effect(simulation: Simulation, left_pct: float, clean: Simulation) -> dict[str, Any]:
+    """The entry of an effect in the truth. simulation: the case with this effect alone."""
+    (effect,) = simulation.effects
     entry = effect.as_json() | {"left_alone_pct": left_pct}
     if effect.kind.adds_light:
-        added = np.mean(chain.mean, axis=0) - np.mean(clean.mean, axis=0)
-        entry["light_map"] = {"size_px": chain.plan.size_px, "values": _map(added)}
+        added = np.mean(simulation.mean, axis=0) - np.mean(clean.mean, axis=0)
+        entry["light_map"] = {"size_px": simulation.plan.size_px, "values": _map(added)}
     return entry
 
 
@@ -116,8 +116,8 @@ def _map(change: Plane) -> list[list[float]]:
 
 
 def _at_target(
-    effect: Effect, target_pct: float | None, clean: Chain, estimator: LinearEstimator
-) -> tuple[Chain, float]:
+    effect: Effect, target_pct: float | None, clean: Simulation, estimator: LinearEstimator
+) -> tuple[Simulation, float]:
     """The images with this effect alone at the chosen strength, and the residual that it leaves, percent, to first
     order.
 
@@ -125,8 +125,8 @@ def _at_target(
     None: the strength is not changed.
     """
     for trial in range(TRIALS + 1):
-        chain = clean.with_effects(effect)
-        left_pct = estimator.left_pct([frame.pixels for frame in _frames(chain)])
+        simulation = clean.with_effects(effect)
+        left_pct = estimator.left_pct([frame.pixels for frame in _frames(simulation)])
         if target_pct is None or trial == TRIALS:
             break
         short = target_pct / max(left_pct, 1e-6)
@@ -135,26 +135,26 @@ def _at_target(
         if max(short, 1 / short) < STRENGTH_WITHIN or strength == effect.strength:
             break
         effect = effect.at(strength)
-    return chain, left_pct
+    return simulation, left_pct
 
 
 def _file(n: int) -> str:
     return f"{n:03d}.fits"
 
 
-def _frames(chain: Chain) -> tuple[Frame, ...]:
+def _frames(simulation: Simulation) -> tuple[Frame, ...]:
     """Frames of mean images, with the exact positions of the occulter. Clipped pixels are filled as in a transit from
     a folder."""
     exposures = []
-    for n, (rate, shot) in enumerate(zip(chain.mean, chain.plan.shots, strict=True)):
-        level = chain.level if chain.level is not None and shot.gain_mode == HIGH else np.inf
+    for n, (rate, shot) in enumerate(zip(simulation.mean, simulation.plan.shots, strict=True)):
+        level = simulation.level if simulation.level is not None and shot.gain_mode == HIGH else np.inf
         gaps = rate * shot.exposure_s >= level * (1 - 1e-9)
         exposures.append(
             Exposure(
                 file=_file(n),
                 pixels=rate.astype(np.float32),
                 pointing=shot.pointing,
-                place=chain.plan.place(n),
+                place=simulation.plan.place(n),
                 exposure_s=shot.exposure_s,
                 time_s=shot.time_s,
                 gain_mode=shot.gain_mode,

@@ -48,44 +48,40 @@ class Run:
 
 
 def run_set(
-    made: BlindSet,
+    blind_set: BlindSet,
     numbers: Sequence[int],
-    command: Sequence[str],
+    diagnosis: Sequence[str],
     *,
-    processes: int = 1,
     bound: Sequence[str] = (),
+    processes: int = 1,
     keep: bool = False,
     longest_s: float = LONGEST_S,
     progress: Progress = lambda line: None,
 ) -> list[Run]:
     """Diagnose the cases that have no report yet. Returns one run for each of these cases, in the order of `numbers`.
 
-    command: a program and its arguments; {transit} and {report} stand for the paths. processes: number of diagnoses
-    at the same time. bound: a program and its arguments; it computes the bound. {expected} and {bound} stand for the
-    paths. If `bound` is empty, no program is run. If the program fails, the diagnosis is not affected, and the next
-    run tries the program again. keep: whether to keep the images of a case after their use. longest_s: a process that
-    takes longer is killed. Raises DataError "bad-command", "bad-seals", and "not-sealed" if a case has no seal.
+    diagnosis, bound: a program and its first arguments. Two arguments are added: a folder of images, and the file of
+    the result. diagnosis: it gets the transit and writes the report. bound: it gets the images without noise and writes
+    the bound; empty: no program is run. If it fails, the diagnosis is not affected, and the next run tries it again.
+    processes: number of diagnoses at the same time. keep: whether to keep the images of a case after their use.
+    longest_s: a process that takes longer is killed. Raises DataError "bad-seals", and "not-sealed" if a case has no
+    seal.
     """
-    for words, marks in ((command, ("{transit}", "{report}")), (bound, ("{expected}", "{bound}"))):
-        if words and not all(any(mark in word for word in words) for mark in marks):
-            raise DataError(
-                "bad-command", f"expected {' and '.join(marks)} in the command; got {' '.join(words)}"
-            )
     for number in numbers:
-        if not made.is_made(number):
+        if not blind_set.is_made(number):
             raise DataError(
                 "not-sealed",
                 f"case {number:04d}: expected a truth that was sealed before the diagnosis; got no seal: make the "
                 "case again",
             )
 
-    def result(number: int, words: Sequence[str], folder: Path, file: Path, schema: str) -> Run | None:
+    def result(number: int, program: Sequence[str], folder: Path, file: Path, schema: str) -> Run | None:
         """Run a program if its result is missing. Its images are deleted after their use."""
-        if not words or not folder.is_dir():
+        if not program or not folder.is_dir():
             return None
         run = None
         if result_in(file, schema) is None:
-            run = _run(number, words, folder, file, schema, longest_s)
+            run = _run(number, program, folder, file, schema, longest_s)
             what = f"no {file.stem}: {run.error.splitlines()[-1]:.100}" if run.error else f"{file.stem} made"
             progress(f"case {number:04d}: {what}, {run.wall_s:.1f} s, {run.peak_mib:.0f} MiB")
         if not keep and not (run and run.error):
@@ -93,19 +89,19 @@ def run_set(
         return run
 
     def one(number: int) -> Run | None:
-        run = result(number, command, made.transit(number), made.report(number), REPORT_SCHEMA)
+        run = result(number, diagnosis, blind_set.transit(number), blind_set.report(number), REPORT_SCHEMA)
         if run is not None:
-            write_whole(made.case_folder(number) / "run.json", json.dumps(asdict(run), indent=1))
-        result(number, bound, made.expected(number), made.bound(number), BOUND_SCHEMA)
+            write_whole(blind_set.case_folder(number) / "run.json", json.dumps(asdict(run), indent=1))
+        result(number, bound, blind_set.expected(number), blind_set.bound(number), BOUND_SCHEMA)
         return run
 
     with ThreadPoolExecutor(max(1, processes)) as pool:
         return [run for run in pool.map(one, numbers) if run is not None]
 
 
-def run_of(made: BlindSet, number: int) -> Run | None:
+def run_of(blind_set: BlindSet, number: int) -> Run | None:
     """The last diagnosis of a case; None if there was none."""
-    file = made.case_folder(number) / "run.json"
+    file = blind_set.case_folder(number) / "run.json"
     return Run(**json.loads(file.read_text("utf-8"))) if file.is_file() else None
 
 
@@ -119,16 +115,13 @@ def result_in(file: Path, schema: str) -> dict[str, Any] | None:
     return found if whole else None
 
 
-def _run(number: int, command: Sequence[str], folder: Path, file: Path, schema: str, longest_s: float) -> Run:
+def _run(number: int, program: Sequence[str], folder: Path, file: Path, schema: str, longest_s: float) -> Run:
     """Run a program on a copy of a folder of a case. If its result is complete, it is written to the file."""
     with tempfile.TemporaryDirectory(prefix=f"{folder.name}-") as temporary:
         source, result = Path(temporary) / folder.name, Path(temporary) / file.name
         shutil.copytree(folder, source)
-        filled = [
-            word.replace(f"{{{folder.name}}}", str(source)).replace(f"{{{file.stem}}}", str(result))
-            for word in command
-        ]
-        status, wall_s, peak_mib, said = _watched(filled, Path(temporary), longest_s)
+        command = (*program, str(source), str(result))
+        status, wall_s, peak_mib, said = _watched(command, Path(temporary), longest_s)
         error = f"exit status {status}: {said}" if status else ""
         if not error and result_in(result, schema) is None:
             text = result.read_text("utf-8", errors="replace") if result.is_file() else "no file"

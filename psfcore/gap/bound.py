@@ -33,8 +33,8 @@ from psfcore.fits.blocks import LIMITS
 from psfcore.gap.effect import Change, Effect, EffectParameter
 from psfcore.gap.evidence.closed_form import ClosedForm
 from psfcore.gap.evidence.columns import FieldColumns
-from psfcore.gap.evidence.evidence import gather
 from psfcore.gap.evidence.linear_model import LinearModel
+from psfcore.gap.evidence.responses import gather
 from psfcore.gap.evidence.tree import FAMILIES
 from psfcore.gap.library.registry import LIBRARY
 from psfcore.gap.verdict.answer import NONE, ONE, Labels, causes_of, label_of, prior_of

@@ -25,7 +25,7 @@ from psfcore.gap.verdict.correction import Corrected
 from psfcore.gap.view import Field, View
 from psfcore.psf import REACH_GRID_PX, Kernel, Psf
 from psfcore.scatter.fit import psf_of_fit
-from psfcore.scatter.total_psf import Blur, Lanes, Optics, TotalPsf
+from psfcore.scatter.total_psf import Lanes, Optics, TotalPsf
 from psfcore.transit.transit import Place
 
 
@@ -115,11 +115,7 @@ class _Point(View):
         """The mean images of the pointings. There is only one pointing with one image: the PSF."""
         return list(self.expected)
 
-    def occulted_scene(self, n: int) -> Lanes:
+    @cached_property
+    def occulted_scenes(self) -> Sequence[Lanes]:
         """The scene, in the memory order of the convolution engine. No occulter covers the point source."""
-        return self.solution.optics.lanes(self.scenes[n])
-
-    def blurred(self, n: int, slope: Blur, weight: Field | None = None) -> Field:
-        """The point source, multiplied by `weight` at its position, and convolved with dH (`slope`)."""
-        point = slope.lanes(self.scenes[n] if weight is None else self.scenes[n] * weight)
-        return slope.field(slope.convolve(point))
+        return [self.solution.optics.lanes(self.scenes[0])]

@@ -24,13 +24,14 @@ from psfcore.errors import DataError
 from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.columns import FieldShape, with_effect
 from psfcore.gap.evidence.effect_fits import EffectFit, fit_effects, label_of, p_value_of_gap
-from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.expected_gap import ExpectedGap, linear_model_of
 from psfcore.gap.evidence.linear_model import LinearModel
 from psfcore.gap.evidence.measured_noise import MeasuredNoise, measured_noise
+from psfcore.gap.evidence.responses import Evidence
 from psfcore.gap.library.registry import LIBRARY
 from psfcore.gap.library.scene import MOST_POINTINGS
 from psfcore.gap.verdict.answer import LEAST_IMAGES, Answer, answer_of
+from psfcore.gap.verdict.axes import Axis, ranked_axes
 from psfcore.gap.verdict.calibration import COVERAGE, Calibration, shipped_calibration
 from psfcore.gap.verdict.closure import (
     HeldOut,
@@ -44,7 +45,6 @@ from psfcore.gap.verdict.closure import (
 )
 from psfcore.gap.verdict.correction import Corrected, add_to_model
 from psfcore.gap.verdict.limits import Limits, limits
-from psfcore.gap.verdict.where import Axis, where
 from psfcore.gap.view import View, return_unused_memory
 from psfcore.psf import Psf
 from psfcore.scatter.inversion import Inverter, solution_of
@@ -190,7 +190,9 @@ def diagnose(
         model=model,
         expected=expected,
         noise=noise,
-        where=where(model if told is None else told.model, rng, axes, None if told is None else told.step),
+        where=ranked_axes(
+            model if told is None else told.model, rng, axes, None if told is None else told.step
+        ),
         before_refit=rms if told is None else _before_refit(told, rng),
         rms=rms,
         after=rms if after is None else gap(after.residual_pct, after.noise_pct, rng),
@@ -228,8 +230,8 @@ def _told(model: LinearModel, answer: Answer) -> EffectFit | None:
     model = replace(model, evidence=evidence)
     effects = [effect for effect in evidence.effects if effect.name in names]
     fit = fit_effects(model, effects)
-    kept = set(fit.step.columns)
-    if all(kept.intersection(evidence.columns[effect.name]) for effect in effects):
+    columns = set(fit.step.columns)
+    if all(columns.intersection(evidence.columns[effect.name]) for effect in effects):
         return fit
     return fit_effects(model, effects, any_sign=True)
 

@@ -90,7 +90,7 @@ class View:
     def expected(self) -> Sequence[Field]:
         """The model image of every image [y, x], DN/s."""
         optics = self.solution.optics
-        return self._lazy(lambda n: optics.field(optics.convolve(self.occulted_scene(n))))
+        return self._lazy(lambda n: optics.field(optics.convolve(self.occulted_scenes[n])))
 
     def _lazy(self, field: Callable[[int], Any]) -> _LazyFields:
         return _LazyFields(len(self.solution.transit.frames), field)
@@ -195,12 +195,9 @@ class View:
         out[window] -= (coverage(shape, place)[window] * shown).astype(np.float32)
         return out
 
-    def occulted_scene(self, n: int) -> Lanes:
-        """The scene of image n with its occulter in front, in the memory order of the convolution engine. Read-only."""
-        return self._occulted_scenes[n]
-
     @cached_property
-    def _occulted_scenes(self) -> Sequence[Lanes]:
+    def occulted_scenes(self) -> Sequence[Lanes]:
+        """The scene of every image with its occulter in front, in the memory order of the convolution engine. Read-only."""
         return self._lazy(self._occulted_scene)
 
     def _occulted_scene(self, n: int) -> Lanes:
@@ -225,7 +222,7 @@ class View:
 
         weight: a factor [y, x] for the light of each scene pixel before the convolution (None: 1).
         """
-        scene = self.occulted_scene(n)
+        scene = self.occulted_scenes[n]
         if weight is not None:
             scene = scene * slope.lanes(weight)
         return slope.field(slope.convolve(scene))

@@ -24,7 +24,7 @@ from psfcore.fits.images import write_image
 from psfcore.image import Image
 from psfcore.noise import Noise
 from psfcore.psf import Psf
-from psfcore.simulate.plan import DISC, EAST, WEST, Plan
+from psfcore.simulate.plan import CAMERA, DISC, EAST, WEST, Plan
 
 Plane = NDArray[np.float64]
 
@@ -32,8 +32,6 @@ QUIET_DN_PER_S = 420.0
 SKY_DN_PER_S = 12.0
 _BRIGHT_POINTS = 60  # number of bright points in a field
 DEMO_EXPOSURE_S = 1.4
-DEMO_PHOTON_GAIN_DN = 6.0
-DEMO_READ_NOISE_DN = 2.0
 _DEMO_DISTANCE_M = 5.19e10
 _SOLAR_RADIUS_M = 6.957e8
 _ARCSEC_PER_RADIAN = 206264.80624709636
@@ -331,8 +329,8 @@ def demo_image(path: str | Path, psf: Psf, *, size: int = 1024, seed: int = 1) -
         scene,
         psf,
         exposure_s=DEMO_EXPOSURE_S,
-        photon_gain_dn=DEMO_PHOTON_GAIN_DN,
-        read_noise_dn=DEMO_READ_NOISE_DN,
+        photon_gain_dn=CAMERA.photon_gain_dn,
+        read_noise_dn=CAMERA.read_noise_dn,
         seed=seed,
     )
     mask = np.zeros(pixels.shape, dtype=np.uint8)

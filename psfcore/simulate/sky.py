@@ -10,7 +10,7 @@ pointing is convolved once for all its images; only the hidden light is convolve
 | S_f | scenes[f]: constant scene of pointing f, including the margins beyond the field | DN/s |
 | P S_f | seen_scenes[f]: convolved scene | DN/s |
 | h_i | Behind.hidden: light that the disc hides in image i | DN/s |
-| I_i | expected(i), noise_free[i]: noise-free image i | DN/s |
+| I_i | expected(i): noise-free image i | DN/s |
 
 The share of a pixel behind the disc is exact: the area of the intersection of the disc and the square pixel.
 F(x, y) is the area of the part of the disc that lies left of x and below y. In closed form:
@@ -76,11 +76,6 @@ class TrueSky:
         hidden[around.window()] = around.hidden(self.plan.place(index))
         seen = self.seen_scenes[self.plan.shots[index].pointing]
         return np.asarray(seen - self._hiding.apply(hidden))  # Eq. (1)
-
-    @cached_property
-    def noise_free(self) -> tuple[Plane, ...]:
-        """expected() of every image; computed at first use and kept, 8 bytes per pixel and image."""
-        return tuple(self.expected(index) for index in range(len(self.plan.shots)))
 
     @cached_property
     def _hiding(self) -> Convolver:

@@ -40,20 +40,16 @@ from service.client.operations import Operations
 from workers.contract.requests import GapDiagnose, Report
 
 THREADS = 2  # of a plan
-# The diagnosis runs as a command in another process, which does not know the withheld effects.
+# Programs for a blind set, each with a folder of images and the file of its result as further arguments. The diagnosis runs in
+# another process, which does not know the withheld effects, and imports nothing from the working folder.
 DIAGNOSE = (
     sys.executable,
-    "-P",  # nothing is imported from the working folder
+    "-P",
     "-c",
-    "from service.cli.main import main; main()",
-    "gap",
-    "{transit}",
-    "--json",
-    "{report}",
-    "--local",
+    "import sys; from service.cli.main import main; main(['gap', sys.argv[1], '--json', sys.argv[2], '--local'])",
 )
-# The bound is also computed in another process, because the blind set and the gap library share no code.
-BOUND = (sys.executable, "-P", "-m", "psfcore.gap.bound", "{expected}", "{bound}")
+# The bound too, because the blind set and the gap library share no code.
+BOUND = (sys.executable, "-P", "-m", "psfcore.gap.bound")
 
 
 @contextmanager
@@ -310,10 +306,10 @@ def blind(
     if clean_only and only:
         raise click.UsageError("expected one of --clean-only and --only; got both")
     with user_errors(), alone_in(output):
-        plan = SetPlan(cases, seed, size, images, 0, only, clean_only, not synthetic, left_pct)
+        plan = SetPlan(cases, seed, size, images, only, clean_only, not synthetic, left_pct)
         planes = [image_rate(file, limits()) for file in scenes]
-        made, not_made = make_set(output, plan, scenes=planes, processes=processes, progress=say)
-        numbers = [number for number in plan.numbers if number not in not_made]
+        blind_set, not_made = make_set(output, plan, scenes=planes, processes=processes, progress=say)
+        numbers = [number for number in range(cases) if number not in not_made]
         if not numbers:
             why = next(iter(not_made.values()))
             raise DataError(
@@ -322,8 +318,8 @@ def blind(
         if make_only:
             echo(f"{output}: {len(numbers)} of {cases} cases made and sealed")
             return
-        run_set(made, numbers, DIAGNOSE, bound=BOUND, processes=processes, keep=keep, progress=say)
-        echo(write_score(made, numbers, not_made))
+        run_set(blind_set, numbers, DIAGNOSE, bound=BOUND, processes=processes, keep=keep, progress=say)
+        echo(write_score(blind_set, numbers, not_made))
 
 
 # --- a planned transit ----------------------------------------------------------------------------------

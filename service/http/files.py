@@ -217,8 +217,9 @@ class RequestFile:
     filename: the name that the client gives to the file. bytes: the number of bytes that have arrived.
     """
 
-    def __init__(self, path: Path, filename: str | None = None) -> None:
-        self.path, self.filename, self.bytes = path, filename, 0
+    def __init__(self, path: Path) -> None:
+        self.filename: str | None = None
+        self.bytes = 0
         self._file, self._digest = path.open("wb"), hashlib.sha256()
 
     def __enter__(self) -> Self:
@@ -228,10 +229,9 @@ class RequestFile:
         self._file.close()
 
     def write(self, piece: bytes) -> None:
-        """Add the next bytes of the file; a reader of the path finds them at once."""
+        """Add the next bytes of the file."""
         self._digest.update(piece)
         self._file.write(piece)
-        self._file.flush()
         self.bytes += len(piece)
 
     @property

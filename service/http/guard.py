@@ -42,7 +42,8 @@ SAFE_METHODS = {"GET", "HEAD", "OPTIONS"}
 # refusal needs them.
 FOR_EVERYBODY = "/static/"
 BULK = frozenset({"/v1/bulk", "/v1/bulk/estimate"})  # the only addresses at which large JSON is expected
-# Addresses that limit the size of a body themselves, because the body may contain files; /uws/jobs only of a form.
+# Addresses that limit the size of a body themselves: UPLOADS because it may contain files, UWS_FORMS of a multipart form, so that a
+# client that sends a file is told what to do instead.
 UPLOADS = re.compile(r"(/v1)?/(images|psfs|transits)|/v1/uploads/.*", re.DOTALL)
 UWS_FORMS = re.compile(r"/uws/jobs(/[^/]+/parameters)?")
 # The largest request, a bulk run of 100,000 uploaded images, has one list and one value for each image. Python makes a

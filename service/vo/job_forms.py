@@ -1,63 +1,36 @@
-"""Reads and checks the forms of UWS clients: the parameters of a job, and files that are sent with them.
+"""Checks the parameters of jobs that UWS clients send. Each is a text in a form, and is checked against the contract.
 
-Each parameter of a job is a text in a form; it is checked against the contract. A file is in a part of a multipart form, and
-``UPLOAD=name,param:part`` names it.
-
-Citation: IVOA DALI 1.1 (17 May 2017), standard parameter UPLOAD. The name says what the file is, and determines which
-parameter of the job gets the id of the file: ``UPLOAD=image,param:f`` adds the image in the part ``f``, and sets
-``image_id``. A file is checked and stored in the same way as by ``POST /v1/images``, ``/v1/transits`` or
-``/v1/psfs``. Files at other addresses (``UPLOAD=name,http://...``) are refused: if the service fetched any address,
-clients could use it to reach machines that they cannot reach themselves.
+An input of a job is named by the id that it has since its upload: a form contains no file, and the standard parameter UPLOAD
+(IVOA DALI 1.1) is refused.
 """
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Callable, Iterable, Mapping
-from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field
-from typing import Annotated, Any
+from collections.abc import Iterable
+from contextlib import suppress
+from typing import Any
 
-from fastapi import Depends, Request
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails, from_json
 
 from psfcore.errors import DataError
-from service.http.callers import Caller, Submitting
-from service.http.files import IMAGE, PSF, TRANSIT, Kind, RequestFile, label
-from service.http.forms import FORM, FormPart, Piece, media_type_of
 from service.http.problems import Problem
-from service.http.quotas import Allowed, check_room
-from service.http.state import Shared, State
-from service.vo.parameters import (
-    MAX_FORM_BYTES,
-    NO_XML,
-    bad,
-    multipart_pairs,
-    read_pairs,
-    shown,
-    single,
-)
+from service.http.quotas import check_room
+from service.http.state import State
+from service.vo.parameters import NO_XML, UPLOAD_FIRST, bad, shown
 from workers.contract.kinds import KINDS, REQUESTS
 from workers.contract.suggestions import did_you_mean, explained
-from workers.files.store import Store
 from workers.intake import estimates
 from workers.intake.requests import resolve
 
-# The names in UPLOAD, and for each name the parameter that gets the id of the file.
-NAMES = {"image": "image_id", "mask": "mask_id", "transit": "transit_id", "psf": "psf_id"}
-KINDS_OF: dict[str, Kind[Any]] = {
-    "image": IMAGE,
-    "mask": IMAGE,
-    "transit": TRANSIT,
-    "psf": PSF,
-}
-INLINE = "param:"
-MOST_FILES = len(NAMES)
-COUNTED_BYTES = 2**20  # bytes that are counted against the caller's allowance in one step
-
 
 def kind_of(form: dict[str, str]) -> str:
-    """Remove KIND from a form and return it. Raises ``Problem`` if clients cannot request jobs of this kind."""
+    """Remove KIND from a form and return it.
+
+    Raises ``Problem`` if clients cannot request jobs of this kind, and if the form has the parameter UPLOAD.
+    """
+    if "upload" in form:
+        raise bad(f"expected a form without UPLOAD; got {shown(form['upload'])}: {UPLOAD_FIRST}")
     kind = form.pop("kind", None)
     if kind is None or kind not in REQUESTS:
         hint = did_you_mean(kind or "", REQUESTS)
@@ -133,124 +106,3 @@ def _model(kind: str) -> type[BaseModel]:
     model = KINDS[kind].parameters
     assert model is not None
     return model
-
-
-# Files ----------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Sent:
-    """A form: its fields by their names in lower case, the values of UPLOAD, and the files by the names of their parts."""
-
-    fields: dict[str, str]
-    uploads: tuple[str, ...] = ()
-    parts: Mapping[str, RequestFile] = field(default_factory=dict)
-
-
-async def _sent(request: Request, caller: Submitting, state: Shared) -> AsyncIterator[Sent]:
-    """The form of a request, with its files. The temporary files are removed after the answer."""
-    if media_type_of(request) != FORM:
-        form = single(await read_pairs(request))
-        upload = form.pop("upload", None)
-        yield Sent(form, () if upload is None else tuple(upload.split(";")))
-        return
-    with ExitStack() as resources:
-        files = _Files(state.store, Allowed(state, caller), resources)
-        most = MAX_FORM_BYTES + max(state.settings.max_upload_bytes, state.settings.max_transit_bytes)
-        pairs = [*request.query_params.multi_items(), *await multipart_pairs(request, most, files.write)]
-        named = [value for name, value in pairs if name.lower() == "upload" and value]
-        fields = single((name, value) for name, value in pairs if name.lower() != "upload")
-        yield Sent(fields, tuple(one for value in named for one in value.split(";")), files.parts)
-
-
-SentForm = Annotated[Sent, Depends(_sent)]
-
-
-def files_of(sent: Sent, kind: str) -> dict[str, RequestFile]:
-    """The file for each name in UPLOAD.
-
-    Raises ``Problem`` if UPLOAD is malformed, names a part that the form does not have, or sets a parameter twice; if
-    the kind of job has no such parameter; and if the form contains a file that no UPLOAD names.
-    """
-    possible = [name for name, parameter in NAMES.items() if parameter in _model(kind).model_fields]
-    parts: dict[str, str] = {}
-    for upload in sent.uploads:
-        name, comma, uri = (text.strip() for text in upload.partition(","))
-        name = name.lower()
-        if not comma or not uri.startswith(INLINE):
-            raise bad(
-                f"expected UPLOAD=NAME,{INLINE}PART, and the file in the part PART of a multipart form; got {upload[:80]!a}: "
-                "files at other addresses are not fetched"
-            )
-        if name not in possible:
-            raise bad(
-                f"expected UPLOAD of a file that a job of kind {kind} uses ({', '.join(possible) or 'none'}); got {name[:40]!a}"
-            )
-        part = uri.removeprefix(INLINE)
-        if part not in sent.parts:
-            raise bad(
-                f"expected a part {part[:40]!a} with a file in the form, because UPLOAD names it; got none"
-            )
-        if name in parts or NAMES[name] in sent.fields:
-            raise bad(f"expected one {name}; got several: remove an UPLOAD or the parameter {NAMES[name]}")
-        parts[name] = part
-    unused = sent.parts.keys() - parts.values()
-    if unused:
-        part = min(unused)
-        raise bad(
-            f"expected UPLOAD=NAME,{INLINE}{part[:40]} for the file in the part {part[:40]!a}, with NAME one of {', '.join(possible)}; "
-            "got none"
-        )
-    return {name: sent.parts[part] for name, part in parts.items()}
-
-
-def ids_of(files: Mapping[str, RequestFile]) -> dict[str, str]:
-    """The parameters that the files of a form set: the id of each file, by the name of the parameter."""
-    return {NAMES[name]: file.sha256 for name, file in files.items()}
-
-
-def keep(state: State, caller: Caller, files: Mapping[str, RequestFile]) -> None:
-    """Check the files of a form, and add them to the catalogue. If one of them is refused, none is added.
-
-    Raises ``Problem`` 413, 415 or 422 if a file cannot be used.
-    """
-    rows: list[Any] = []
-    for name, file in files.items():
-        kind = KINDS_OF[name]
-        kind.check_size(file.bytes, state)
-        summary = kind.inspect(file.path, state)
-        rows.append(kind.row(caller.owner, file.sha256, file.bytes, label(file.filename), summary))
-    allowed = Allowed(state, caller)  # the bytes were counted against the caller's rate when they arrived
-    for file, row in zip(files.values(), rows, strict=True):
-        allowed.keep(file.path, file.sha256, row)
-
-
-class _Files:
-    """Writes the files of a form to temporary paths of the store, and counts their bytes.
-
-    parts: the files by the names of their parts.
-    """
-
-    def __init__(self, store: Store, take: Callable[[int], None], resources: ExitStack) -> None:
-        self._store, self._take, self._resources = store, take, resources
-        self._uncounted = 0
-        self._open: dict[FormPart, RequestFile] = {}
-        self.parts: dict[str, RequestFile] = {}
-
-    def write(self, pieces: list[Piece]) -> None:
-        """Write the bytes of files that have arrived."""
-        for sent, data in pieces:
-            if sent not in self._open:
-                self._begin(sent)
-            self._uncounted -= len(data)
-            while self._uncounted < 0:
-                self._take(COUNTED_BYTES)
-                self._uncounted += COUNTED_BYTES
-            self._open[sent].write(data)
-
-    def _begin(self, sent: FormPart) -> None:
-        if sent.name in self.parts or len(self.parts) == MOST_FILES:
-            raise bad(f"expected at most {MOST_FILES} files in parts of different names; got more")
-        path = self._resources.enter_context(self._store.temporary())
-        file = self._resources.enter_context(RequestFile(path, sent.filename))
-        self._open[sent] = self.parts[sent.name] = file

@@ -9,7 +9,6 @@ one runs. Destroying a job does not delete its result. Errors are plain text.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from typing import Annotated, Any
 
 import anyio
@@ -19,12 +18,12 @@ from fastapi.responses import PlainTextResponse, RedirectResponse
 
 from service.api.jobs import check_own, find
 from service.http.callers import Caller, Reading, Submitting
-from service.http.forms import FORM, URL_ENCODED
+from service.http.forms import URL_ENCODED
 from service.http.problems import Problem, problem
 from service.http.state import Shared, State
 from service.views import time_left_s
 from service.vo import job_documents as documents
-from service.vo.job_forms import Sent, SentForm, check, files_of, ids_of, keep, kind_of, resolved
+from service.vo.job_forms import check, kind_of, resolved
 from service.vo.parameters import (
     PLAIN_ERRORS,
     Form,
@@ -45,7 +44,6 @@ from workers.rows import no_such
 MAX_RUN_ID = 256
 MOST = 2**31 - 1
 MOST_LISTED = 10_000  # largest number of jobs in one document, because the document is built in memory
-UPLOADS = "NAME,param:PART: the file in the part PART of a multipart form is the image, mask, transit or psf (NAME) of the job"
 PENDING_ONLY = "parameters can be set only while a job is PENDING"
 FIRST_LOOK_S, LONGEST_LOOK_S = 0.05, 1.0  # a waiting request checks its job at growing intervals
 # The last four are phases of the standard. Jobs of this service are never in these phases, but clients may
@@ -61,16 +59,11 @@ XML: dict[str, Any] = {
 TO_JOB: dict[str, Any] = {"status_code": 303, "response_class": RedirectResponse}
 
 
-def _form(*, files: bool = False, **described: str) -> dict[str, Any]:
-    """A route that reads a form and answers with the address of a job.
-
-    described: the descriptions of the fields. files: whether a multipart form may contain files.
-    """
+def _form(**described: str) -> dict[str, Any]:
+    """A route that reads a form and answers with the address of a job. described: the descriptions of the fields."""
     fields = {name: {"type": "string", "description": text} for name, text in described.items()}
     schema = {"type": "object", "properties": fields, "additionalProperties": {"type": "string"}}
-    media_types = [URL_ENCODED, *([FORM] if files else [])]
-    content = {name: {"schema": schema} for name in media_types}
-    return {**TO_JOB, "openapi_extra": {"requestBody": {"content": content}}}
+    return {**TO_JOB, "openapi_extra": {"requestBody": {"content": {URL_ENCODED: {"schema": schema}}}}}
 
 
 router = APIRouter(
@@ -126,30 +119,15 @@ def list_uws_jobs(request: Request, caller: Reading, state: Shared) -> Response:
     "",
     summary="UWS: create a job",
     **_form(
-        files=True,
         KIND="kind of job, for example deconvolve",
         PHASE="RUN: start the job at once",
         RUNID="your own name for the job",
         EXECUTIONDURATION="seconds that the job may execute",
         DESTRUCTION="time at which the job is destroyed",
-        UPLOAD=UPLOADS,
     ),
 )
-async def create_uws_job(caller: Submitting, sent: SentForm, request: Request, state: Shared) -> Response:
-    """Create a job. All other fields are parameters of the job; write objects as JSON."""
-    return await _in_turn(_create, caller, sent, request, state)
-
-
-async def _in_turn(work: Callable[..., Response], caller: Caller, sent: Sent, *about: Any) -> Response:
-    """What ``work`` answers to a form. If the form has files, they are inspected when it is the turn of the owner."""
-    *_, state = about
-    if sent.parts:
-        return await state.pixels.run(caller.owner, work, caller, sent, *about)
-    return await run_in_threadpool(work, caller, sent, *about)
-
-
-def _create(caller: Caller, sent: Sent, request: Request, state: State) -> Response:
-    form = dict(sent.fields)
+def create_uws_job(caller: Submitting, form: Form, request: Request, state: Shared) -> Response:
+    """Create a job. All other fields are parameters of the job; write objects as JSON, and inputs by the ids of their uploads."""
     run_id, start = form.pop("runid", None), form.pop("phase", None)
     duration, destruction = form.pop("executionduration", None), form.pop("destruction", None)
     kind = kind_of(form)
@@ -157,14 +135,11 @@ def _create(caller: Caller, sent: Sent, request: Request, state: State) -> Respo
         raise bad(f"expected RUNID of at most {MAX_RUN_ID} printable characters; got {run_id[:40]!a}")
     if start not in (None, "RUN"):
         raise bad(f"expected PHASE=RUN or no PHASE; got {start[:40]!a}")
-    files = files_of(sent, kind)
-    form |= ids_of(files)
     check(kind, form)
-    keep(state, caller, files)
     ready = resolved(state, caller.owner, kind, form) if start else None
     row = state.catalogue.uws.draft(
         kind,
-        dict(form),
+        form,
         run_id=run_id,
         execution_duration_s=_duration(state, duration or "0"),
         destruction_at=_destruction(state, destruction),
@@ -293,20 +268,12 @@ def get_uws_parameters(row: Job) -> Response:
     return _xml(documents.parameters(row))
 
 
-@router.post(
-    "/{job_id}/parameters",
-    summary="UWS: change a pending job's parameters",
-    **_form(files=True, UPLOAD=UPLOADS),
-)
-async def post_uws_parameters(
-    job_id: str, caller: Submitting, sent: SentForm, request: Request, state: Shared
+@router.post("/{job_id}/parameters", summary="UWS: change a pending job's parameters", **_form())
+def post_uws_parameters(
+    job_id: str, caller: Submitting, form: Form, request: Request, state: Shared
 ) -> Response:
     """Set parameters of a PENDING job. Parameters that are not sent do not change."""
-    return await _in_turn(_amend, caller, sent, job_id, request, state)
-
-
-def _amend(caller: Caller, sent: Sent, job_id: str, request: Request, state: State) -> Response:
-    row, form = _find(job_id, caller, state), dict(sent.fields)
+    row = _find(job_id, caller, state)
     if row.phase != Phase.PENDING:
         raise _not_now(row, PENDING_ONLY)
     if kind_of({"kind": row.kind} | form) != row.kind:
@@ -314,10 +281,6 @@ def _amend(caller: Caller, sent: Sent, job_id: str, request: Request, state: Sta
             f"expected KIND={row.kind}; got {form['kind']}: the kind of a job cannot change, so create another job"
         )
     form.pop("kind", None)
-    files = files_of(sent, row.kind)
-    form |= ids_of(files)
-    check(row.kind, row.parameters | form)
-    keep(state, caller, files)
 
     def change(given: dict[str, Any]) -> dict[str, Any]:
         check(row.kind, given | form)

@@ -14,16 +14,20 @@ from typing import Annotated, Any, NoReturn
 from urllib.parse import parse_qsl
 
 from fastapi import Depends, Request, Response
-from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import PlainTextResponse
 from fastapi.routing import APIRoute
 
-from service.http.forms import FORM, URL_ENCODED, FormPart, Piece, chunks_of, media_type_of, pieces_of
+from service.http.forms import FORM, URL_ENCODED, FormPart, chunks_of, media_type_of, pieces_of
 from service.http.problems import Problem
 
 MAX_FORM_BYTES = 2**20
 MAX_FIELDS = 64
 SHOWN = 120
+# What to do instead of sending a file with a job (DALI's UPLOAD).
+UPLOAD_FIRST = (
+    "upload each input of a job first, by POST /v1/images, /v1/psfs or /v1/transits, and send its id in the field image_id, mask_id, "
+    "psf_id or transit_id"
+)
 # Characters that XML 1.0 cannot contain.
 NO_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 VOTABLE_TYPE, JSON_TYPE = "application/x-votable+xml", "application/json"
@@ -34,10 +38,13 @@ _INTEGER = re.compile(r"-?[0-9]{1,15}", re.ASCII)
 
 
 async def read_pairs(request: Request) -> list[tuple[str, str]]:
-    """The names and values of the fields of the address and of a form. Raises ``Problem`` if the body is not a form."""
+    """The names and values of the fields of the address and of a form, in their order.
+
+    Raises ``Problem`` if the body is not a form, is too large, or contains a file.
+    """
     media_type = media_type_of(request)
     if media_type == FORM:
-        sent = await multipart_pairs(request, MAX_FORM_BYTES)
+        sent = await _multipart_pairs(request)
     else:
         body = b"".join([chunk async for chunk in chunks_of(request)])  # service.http.guard bounds its size
         if body and media_type not in ("", URL_ENCODED):
@@ -51,30 +58,17 @@ async def read_pairs(request: Request) -> list[tuple[str, str]]:
     return [*request.query_params.multi_items(), *sent]
 
 
-async def multipart_pairs(
-    request: Request, most_bytes: int, keep: Callable[[list[Piece]], None] | None = None
-) -> list[tuple[str, str]]:
-    """The names and values of the fields of a multipart form, in their order.
-
-    keep: a function that takes the pieces of the files, and is called in a thread; None: the form must not contain files.
-    Raises ``Problem`` if the form is broken or too large.
-    """
+async def _multipart_pairs(request: Request) -> list[tuple[str, str]]:
     texts: dict[FormPart, bytearray] = {}
-    got = 0
-    async for pieces in pieces_of(request, most_bytes):
-        files = [one for one in pieces if one[0].filename is not None]
+    async for pieces in pieces_of(request, MAX_FORM_BYTES):
         for part, piece in pieces:
-            if part.filename is None:
-                texts.setdefault(part, bytearray()).extend(piece)
-                got += len(piece)
+            if part.filename is not None:
+                raise bad(
+                    f"expected a form without files; got a file in the part {shown(part.name)}: {UPLOAD_FIRST}"
+                )
+            texts.setdefault(part, bytearray()).extend(piece)
         if len(texts) > MAX_FIELDS:
             raise bad(f"expected a form of at most {MAX_FIELDS} fields; got more")
-        if got > MAX_FORM_BYTES:
-            raise bad(f"expected fields of at most {MAX_FORM_BYTES} bytes in all, got more", 413)
-        if files and keep is None:
-            raise bad("expected a form of fields without files; got a file")
-        if files and keep is not None:
-            await run_in_threadpool(keep, files)
     try:
         return [(part.name, text.decode()) for part, text in texts.items()]
     except UnicodeDecodeError as error:

@@ -70,7 +70,7 @@ def observed(of: TrueSky, seed: int = 3) -> SimulatedTransit:
 def noise_free(of: TrueSky, seed: int = 3) -> Transit:
     """The same transit without noise; the errors of the ephemeris are those of the noisy one."""
     transit = observed(of, seed).transit
-    return with_pixels(transit, of.noise_free)
+    return with_pixels(transit, [of.expected(n) for n in range(len(of.plan.shots))])
 
 
 def with_pixels(transit: Transit, pixels: Sequence[NDArray[np.floating]]) -> Transit:

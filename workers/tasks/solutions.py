@@ -17,9 +17,9 @@ from dataclasses import dataclass
 
 from psfcore.errors import DataError
 from psfcore.scatter.inversion import ALGORITHM_VERSION, invert
-from psfcore.scatter.kept import read_solution, write_solution
 from psfcore.scatter.reconstruction import Progress, Solution
 from psfcore.scatter.shapes import Shape, Vector
+from psfcore.scatter.solution_file import read_solution, write_solution
 from psfcore.transit.transit import Transit
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.owners import OverQuota

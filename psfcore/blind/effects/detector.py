@@ -183,8 +183,8 @@ def nonlinearity(effect: Effect, dn: Plane, moment: Moment, earlier: list[Earlie
     """Faint signals are read too low: by a power law below a knee, or because traps keep the first charges."""
     size, knee_dn = np.abs(dn), effect["knee_dn"]
     if effect["trap"]:
-        kept = effect.strength * knee_dn * (1 - np.exp(-size / knee_dn))
-        return np.asarray(np.sign(dn) * (size - kept))
+        loss = effect.strength * knee_dn * (1 - np.exp(-size / knee_dn))
+        return np.asarray(np.sign(dn) * (size - loss))
     # Below the knee the signal is raised to the power 1 + p. The strength is the fraction lost at 1/20 of the knee.
     power = -np.log1p(-effect.strength) / np.log(20)
     return np.asarray(dn * np.minimum(np.maximum(size, 1e-3) / knee_dn, 1.0) ** power)

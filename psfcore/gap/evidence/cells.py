@@ -68,11 +68,11 @@ def cells_of(dark: Pixels, x_px: float, y_px: float) -> Cells:
         ring = (share >= low) & ((share < high) | (high >= 1.0))
         sector = np.floor((angle + np.pi / sectors) / (2 * np.pi / sectors)).astype(int) % sectors
         members.extend(ring & (sector == k) for k in range(sectors))
-    kept = [m for m in members if m.sum() >= LEAST_PIXELS]
-    weights = np.array([m / m.sum() for m in kept])
+    cells = [m for m in members if m.sum() >= LEAST_PIXELS]
+    weights = np.array([m / m.sum() for m in cells])
     return Cells(
         weights=weights,
-        pixels=np.array([float(m.sum()) for m in kept]),
+        pixels=np.array([float(m.sum()) for m in cells]),
         radius=weights @ share,
         azimuth=np.angle(weights @ (np.exp(1j * angle) * share)),
     )

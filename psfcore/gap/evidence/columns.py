@@ -43,7 +43,7 @@ from numpy.typing import NDArray
 from psfcore.convolution.convolver import Convolver, linear_convolve
 from psfcore.gap.effect import Change, Effect, EffectParameter
 from psfcore.gap.evidence.cells import DiscCells
-from psfcore.gap.evidence.evidence import Evidence
+from psfcore.gap.evidence.responses import Evidence
 from psfcore.gap.evidence.tree import FAMILIES, WIDTHS, Field
 from psfcore.gap.view import Matrix, Vector
 

@@ -17,8 +17,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from psfcore.gap.effect import Effect
-from psfcore.gap.evidence.evidence import Evidence, gather, residuals_at
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
+from psfcore.gap.evidence.responses import Evidence, gather, residuals_at
 from psfcore.gap.view import View
 from psfcore.scatter.inversion import invert
 from psfcore.scatter.reconstruction import Progress, labelled

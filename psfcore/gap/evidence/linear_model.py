@@ -35,7 +35,7 @@ import numpy as np
 
 from psfcore.arrays import scaled_inverse
 from psfcore.gap.evidence.cells import whitening
-from psfcore.gap.evidence.evidence import Evidence
+from psfcore.gap.evidence.responses import Evidence
 from psfcore.gap.view import Matrix, Vector
 
 FLOOR = 0.003  # f of Eq. (2)

@@ -74,7 +74,7 @@ class PlaceSearch:
             plane = sensitivities(solution.optics, dark, np.full((1, dark[0].size), 1 / dark[0].size))[0]
             self._planes.append(block_means(plane, STEP_PX) * STEP_PX**2)
             self._fine.append(block_means(plane, FINE_PX) * FINE_PX**2)
-            scene = solution.optics.field(view.occulted_scene(n))
+            scene = solution.optics.field(view.occulted_scenes[n])
             to_displacements.append(_sums(plane[None].astype(np.float64), scene, KERNEL_REACH_PX)[0])
             to_far.append(_at_displacements(self._planes[-1], block_means(scene, STEP_PX)))
         self._to_displacements = np.array(to_displacements, dtype=np.float32)
@@ -258,7 +258,7 @@ def near_discs(view: View, images: Sequence[int]) -> list[NearDisc]:
         along /= max(float(np.linalg.norm(along)), 1e-300)
         white = white - np.outer(along, along @ white)
         planes = (white @ flat).astype(np.float32).reshape(planes.shape)
-        scene = solution.optics.field(view.occulted_scene(n))
+        scene = solution.optics.field(view.occulted_scenes[n])
         to_displacements = _sums(planes, scene, NEAR_REACH_PX, top, left)
         out.append(NearDisc(top, left, planes, white @ (weights @ residual), to_displacements))
     return out

@@ -25,8 +25,8 @@ from psfcore.gap.report.report import (
     percent_words,
     words,
 )
+from psfcore.gap.verdict.axes import SIGN_FLIPS
 from psfcore.gap.verdict.correction import ROUNDS
-from psfcore.gap.verdict.where import SIGN_FLIPS
 
 Report = dict[str, Any]
 Row = list[str]

@@ -18,8 +18,8 @@ from psfcore.gap.evidence.columns import FieldShape, another
 from psfcore.gap.evidence.effect_fits import EffectFit, left_chi2
 from psfcore.gap.evidence.tree import FAMILIES, SUN, family_of, listed
 from psfcore.gap.verdict.answer import LEAST_IMAGES, Alternative, Cause
+from psfcore.gap.verdict.axes import SIGNIFICANT
 from psfcore.gap.verdict.closure import HeldOut, Interval
-from psfcore.gap.verdict.where import SIGNIFICANT
 from psfcore.scatter.reconstruction import Inversion
 
 SCHEMA = "gap/3"

@@ -64,5 +64,5 @@ class Calibration:
 @cache
 def shipped_calibration() -> Calibration:
     """The calibration in the file that belongs to this version of the library of effects."""
-    kept = json.loads(files("psfcore.gap.verdict").joinpath(FILE).read_text("utf-8"))
-    return Calibration(tuple(map(float, kept["levels"])), kept["about"])
+    content = json.loads(files("psfcore.gap.verdict").joinpath(FILE).read_text("utf-8"))
+    return Calibration(tuple(map(float, content["levels"])), content["about"])

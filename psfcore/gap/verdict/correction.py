@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from psfcore.errors import DataError
 from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.effect_fits import EffectFit, fit_effects, label_of, left_chi2
-from psfcore.gap.evidence.evidence import Evidence, gather, residuals_at
 from psfcore.gap.evidence.linear_model import LinearModel
+from psfcore.gap.evidence.responses import Evidence, gather, residuals_at
 from psfcore.gap.view import Vector, View, return_unused_memory
 from psfcore.scatter.inversion import invert, solution_at
 from psfcore.scatter.reconstruction import Progress, Solution
@@ -168,15 +168,15 @@ def _with_old_jacobian(model: LinearModel, view: View, held: Sequence[Effect]) -
     """The linear model at another PSF: its residuals and its Jacobian of the PSF, with the Jacobian of the effects and the noise of `model`."""
     before, first = model.evidence, len(model.evidence.base)
     every = {effect.name: effect.parameters for effect in before.effects}
-    kept, columns = list[int](), dict[str, tuple[int, ...]]()
+    numbers, columns = list[int](), dict[str, tuple[int, ...]]()
     for effect in held:
         names = {parameter.name for parameter in effect.parameters}
         pairs = zip(every[effect.name], before.columns[effect.name], strict=False)
         own = [column for parameter, column in pairs if parameter.name in names]
-        columns[effect.name] = tuple(range(first + len(kept), first + len(kept) + len(own)))
-        kept += own
+        columns[effect.name] = tuple(range(first + len(numbers), first + len(numbers) + len(own)))
+        numbers += own
     changes = [change for effect in held for change in effect.changes(view)]
-    evidence = residuals_at(view, before, kept, changes)
+    evidence = residuals_at(view, before, numbers, changes)
     evidence = replace(evidence, effects=tuple(held), columns=columns)
     return replace(model, evidence=_with_noise_of(before, evidence))
 
@@ -226,8 +226,8 @@ def _with_noise_of(before: Evidence, after: Evidence) -> Evidence:
     discs = []
     for disc in after.discs:
         was = were.get(disc.index, disc)
-        kept = was if was.covariance.shape == disc.covariance.shape else disc
-        discs.append(replace(disc, covariance=kept.covariance, level_before=was.level))
+        source = was if was.covariance.shape == disc.covariance.shape else disc
+        discs.append(replace(disc, covariance=source.covariance, level_before=was.level))
     return replace(
         after, discs=tuple(discs), unocculted=replace(after.unocculted, variance=before.unocculted.variance)
     )

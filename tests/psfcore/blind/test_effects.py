@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from psfcore.blind.chain import Chain, EffectFree
 from psfcore.blind.effects.effect import STAGES, Earlier, Effect, Moment, apply_effects
 from psfcore.blind.effects.fine_optics import (
     FINE,
@@ -19,7 +18,8 @@ from psfcore.blind.effects.fine_optics import (
     fine_optics,
 )
 from psfcore.blind.effects.registry import EFFECTS, KNOWN, WITHHELD, effect_named
-from psfcore.blind.leftover import LinearEstimator
+from psfcore.blind.residuals import LinearEstimator
+from psfcore.blind.simulation import EffectFree, Simulation
 from psfcore.convolution.convolver import Convolver
 from psfcore.errors import DataError
 from psfcore.gap.evidence.tree import FAMILIES
@@ -55,8 +55,8 @@ def effect_free(plan: Plan, optics: FineOptics) -> EffectFree:
 
 
 @pytest.fixture(scope="module")
-def clean(effect_free: EffectFree) -> Chain:
-    return Chain(effect_free, (), 5)
+def clean(effect_free: EffectFree) -> Simulation:
+    return Simulation(effect_free, (), 5)
 
 
 def test_the_effects_of_the_library_and_two_groups_of_others_with_the_families_of_the_diagnosis(
@@ -78,7 +78,7 @@ def test_the_effects_of_the_library_and_two_groups_of_others_with_the_families_o
         effect_named("gremlins")
 
 
-def test_an_effect_changes_images_unless_its_strength_is_0(plan: Plan, clean: Chain) -> None:
+def test_an_effect_changes_images_unless_its_strength_is_0(plan: Plan, clean: Simulation) -> None:
     dn = clean.read_out()
     for name, kind in EFFECTS.items():
         effect = kind.drawn(plan, np.random.default_rng(8))
@@ -119,7 +119,7 @@ def test_a_scene_uniform_within_pixels_gives_the_same_with_fine_and_binned_kerne
 
 
 def test_effects_of_the_optics_and_charge_that_repels_conserve_light(
-    plan: Plan, optics: FineOptics, clean: Chain
+    plan: Plan, optics: FineOptics, clean: Simulation
 ) -> None:
     for name in ("anisotropic_scatter", "one_sided_scatter", "core_blur", "focus_drift"):
         effect = EFFECTS[name].drawn(plan, np.random.default_rng(2))
@@ -132,7 +132,9 @@ def test_effects_of_the_optics_and_charge_that_repels_conserve_light(
     assert spread.std() < rate.std()
 
 
-def test_effects_change_light_where_and_as_they_say(plan: Plan, optics: FineOptics, clean: Chain) -> None:
+def test_effects_change_light_where_and_as_they_say(
+    plan: Plan, optics: FineOptics, clean: Simulation
+) -> None:
     effect = effect_of("field_dependent_scatter", 0.5, angle_deg=0.0, bowl=0.5)
     lit = np.zeros(optics.field)
     lit[SIZE_PX, 2 * SIZE_PX - 40] = 1.0  # a point away from the centre along +x: more scatter
@@ -193,7 +195,7 @@ def test_effects_of_the_readout_change_dn_as_defined(plan: Plan) -> None:
     assert after.sum() == pytest.approx(100.0, abs=1e-6)  # of row 9, whose trail ends before the last row
 
 
-def test_every_effect_of_the_tests_leaves_a_residual_in_the_discs(plan: Plan, clean: Chain) -> None:
+def test_every_effect_of_the_tests_leaves_a_residual_in_the_discs(plan: Plan, clean: Simulation) -> None:
     frames = [
         Frame(f"{n}.fits", rate.astype("f4"), shot.pointing, plan.place(n), shot.exposure_s, shot.time_s)
         for n, (rate, shot) in enumerate(zip(clean.rates, plan.shots, strict=True))

@@ -216,6 +216,10 @@ def test_a_set_keeps_its_truth_its_plan_and_one_run(made: BlindSet, tmp_path: Pa
     with pytest.raises(DataError, match="bad-seals"):
         copy.seals()
     before = made.truth_file(0).read_bytes(), made.seals_file.read_bytes()
+    about = made.folder / "set.json"
+    about.write_text(
+        json.dumps(json.loads(about.read_text()) | {"first": 0})
+    )  # as an earlier version wrote it
     make_set(made.folder, TWO)
     assert (made.truth_file(0).read_bytes(), made.seals_file.read_bytes()) == before
     older = dataclasses.asdict(TWO) | {"scenes": []}  # written before sets stated their draw
@@ -249,16 +253,9 @@ def test_a_case_that_fails_is_named_and_the_others_are_made(
     said: list[str] = []
     made, not_made = make_set(tmp_path, plan, progress=said.append)
     assert not_made == {1: "bad-scene: expected light in the scene"}
-    assert [made.is_made(number) for number in plan.numbers] == [True, False, True]
+    assert [made.is_made(number) for number in range(3)] == [True, False, True]
     assert sum("could not make case 0001" in line for line in said) == 1
     failing.clear()
-    # The next run tries again. A last seal that a power failure cut is ignored and removed.
-    whole = made.seals_file.read_text()
-    for cut in ('{"case": 1, "sha', '{"case": 1, "sha256": "cd"}'):
-        made.seals_file.write_text(whole + cut)
-        assert set(made.seals()) == {0, 2}
-    assert make_set(tmp_path, plan)[1] == {} and made.is_made(1)
-    assert made.seals_file.read_text().startswith(whole) and set(made.seals()) == {0, 1, 2}
-    made.seals_file.write_text('{"case"')
-    make_set(tmp_path, plan)
-    assert set(made.seals()) == {0, 1, 2}
+    before = made.seals_file.read_text()
+    assert make_set(tmp_path, plan)[1] == {} and made.is_made(1)  # the next run tries again
+    assert made.seals_file.read_text().startswith(before) and set(made.seals()) == {0, 1, 2}

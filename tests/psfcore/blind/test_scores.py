@@ -1,17 +1,15 @@
-"""The tables of the blind set: hand-made truths, reports and bounds; figures computed by hand."""
+"""The table of a blind set: hand-made truths, reports and bounds; figures computed by hand."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.image import imread
 
 from psfcore.blind.effects.effect import EFFECTS, STAGES, Effect
-from psfcore.blind.judged import LEVELS, Judged, true_closure
-from psfcore.blind.score import score, score_png, share, table, wilson
+from psfcore.blind.judge import LEVELS, DiagnosedCase, true_closure
+from psfcore.blind.score import row, score, table, wilson
 
 BOUNDS: dict[str, tuple[float, ...]] = {  # noncentrality, detected, name, family, stage
     "hidden": (5.0, 0.1, 0.0, 0.1, 0.2),
@@ -36,7 +34,9 @@ def entry(*causes: str, level: str = "", **more: Any) -> dict[str, Any]:
     return {"level": level, "words": "", "alternatives": alternatives, "field": None, "closure": None} | more
 
 
-def case(true: str, classes: str, *entries: dict[str, Any], left: float = 5.0, **report: Any) -> Judged:
+def case(
+    true: str, classes: str, *entries: dict[str, Any], left: float = 5.0, **report: Any
+) -> DiagnosedCase:
     """A case. true, classes: the names of its effects, and their classes ("-": no bound)."""
     effects = [Effect(EFFECTS[name], 1.0, {}).as_json() | {"left_alone_pct": left} for name in true.split()]
     known = [effect["cause"] == effect["name"] for effect in effects]
@@ -44,17 +44,17 @@ def case(true: str, classes: str, *entries: dict[str, Any], left: float = 5.0, *
     keys = ("noncentrality", "detected", *LEVELS)
     bounds = [dict(zip(keys, BOUNDS[one], strict=True)) for one in classes.split() if one != "-"]
     said = {"verdict": "attributed" if entries else "none", "causes": list(entries), **report}
-    return Judged(0, truth, said, 10.0, {"causes": bounds} if bounds else None)
+    return DiagnosedCase(0, truth, said, 10.0, {"causes": bounds} if bounds else None)
 
 
 def test_wilson_agrees_with_the_textbook_and_ratios_are_scaled() -> None:
     assert wilson(0, 0) == (0.0, 1.0)
     assert wilson(8, 10) == pytest.approx((0.4902, 0.9433), abs=1e-4)
     assert wilson(0, 10) == pytest.approx((0.0, 0.2775), abs=1e-4)
-    ratio = share("", [True] * 3 + [False], expected=[0.5] * 4)
+    ratio = row("", [True] * 3 + [False], expected=[0.5] * 4)
     assert (ratio["n"], ratio["value"]) == (4, 1.5)
     assert ratio["wilson95"] == pytest.approx([2 * end for end in wilson(3, 4)])
-    nothing = share("", [False], expected=[0.0])
+    nothing = row("", [False], expected=[0.0])
     assert (nothing["n"], nothing["value"], nothing["wilson95"]) == (1, None, None)
 
 
@@ -155,33 +155,32 @@ FIGURES = {
     "closure / true closure, median": (2, (0.9 + 0.72) / 2 / 0.96, False),
     "strongest axis is right": (5, 1 / 5, False),
     "time of the slowest case, s": (16, 10.0, True),
+    "open: right at the level of name": (2, 0.0, None),
+    "open: right at the level of family": (2, 0.0, None),
+    "open: right at the level of stage": (2, 0.0, None),
+    "isolable: right at the level of name": (11, 7 / 11, None),
+    "isolable: right at the level of family": (11, 8 / 11, None),
+    "isolable: right at the level of stage": (11, 10 / 11, None),
 }
 
 
 def test_every_figure_equals_the_one_computed_by_hand() -> None:
-    found = score(CASES)
+    found = score(CASES, {7: "exit status 1: no light"})
     rows = {row["figure"]: (row["n"], row["value"], row["met"]) for row in found["rows"]}
-    assert list(rows) == list(FIGURES)
-    for figure, (cases, value, met) in FIGURES.items():
-        assert rows[figure] == (cases, pytest.approx(value), met), figure
+    assert rows == {
+        figure: (cases, pytest.approx(value), met) for figure, (cases, value, met) in FIGURES.items()
+    }
+    bounds = {row["figure"]: row["bound"] for row in found["rows"] if row["bound"] is not None}
+    levels = {f"{name}: right at the level of {level}" for name in ("open", "isolable") for level in LEVELS}
+    assert bounds.keys() == levels and bounds["isolable: right at the level of family"] == pytest.approx(0.9)
     assert true_closure(CASES[2].truth) == pytest.approx(1 - 1 / 25)
     assert true_closure({"residuals": []}) is None
-    isolable = found["levels"][1]
-    assert (isolable["class"], isolable["n"], isolable["name"]["right"]) == ("isolable", 11, 7)
-    assert isolable["name"]["bound"] == pytest.approx(0.8)
-    assert [one["n"] for one in found["power"]] == [3, 0, 2, 0, 11, 0]
-    confusion = found["confusion"]
-    assert confusion["clean"] == {"none": 1, "ghost": 1}
-    assert confusion["mesh_pitch"] == {"other psf": 1} and confusion["groove_streak"] == {"ghost": 1}
-    assert sum(sum(row.values()) for row in confusion.values()) == 19
-    assert found["cases"][8]["causes"][0]["class"] == "isolable" and found["cases"][8]["wrong_alone"] == 1
-    text = table(score(CASES, {7: "exit status 1: no light"}))
-    assert "0007: exit status 1: no light" in text and "0.64 (0.80)" in text
-    assert score([])["rows"][0]["value"] is None
-
-
-def test_the_picture_is_drawn_with_and_without_cases(tmp_path: Path) -> None:
-    for name, cases in (("full", CASES), ("empty", [])):
-        score_png(score(cases), tmp_path / f"{name}.png")
-        pixels = imread(tmp_path / f"{name}.png")
-        assert pixels.shape[0] > 400 and pixels[..., :3].std() > 0.02, name
+    wrong = found["cases"][8]
+    assert (wrong["causes"][0]["class"], wrong["causes"][0]["covered"], wrong["wrong_alone"]) == (
+        "isolable",
+        False,
+        1,
+    )
+    text = table(found)
+    assert "0007: exit status 1: no light" in text and f"{7 / 11:.3f}" in text
+    assert score([], {})["rows"][0]["value"] is None

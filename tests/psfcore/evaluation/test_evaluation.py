@@ -45,7 +45,7 @@ def test_a_wrong_psf_leaves_the_residual_of_an_exact_inverse() -> None:
     assert max(float(np.abs(f.pe_pct).max()) for f in found.frames) < 0.1
     assert found.superposed.mape_mean_pct < 0.01
     for n, frame in enumerate(found.frames):
-        assert residual_against_pct(frame, sky().noise_free[n]) == pytest.approx(frame.residual_pct, abs=1e-4)
+        assert residual_against_pct(frame, sky().expected(n)) == pytest.approx(frame.residual_pct, abs=1e-4)
     # Compared with a double-precision inverse: invert, set the disc to zero, convolve.
     for total, n in ((1.1 * SCATTER.total, 0), (0.0, 5)):
         found = judged(total)
@@ -77,7 +77,7 @@ def test_residuals_scatter_by_their_stated_noise() -> None:
     assert abs(np.mean(centre)) < 0.35 and abs(np.mean([f.residual_pct / f.noise_pct for f in frames])) < 0.35
     assert all(3 * f.noise_pct < f.centre_noise_pct < 8 * f.noise_pct for f in frames)
     # Noise of the disc's own pixels makes most of a residual: relative to images without noise it is small.
-    against = [residual_against_pct(f, sky().noise_free[f.index]) for f in noisy(11).frames]
+    against = [residual_against_pct(f, sky().expected(f.index)) for f in noisy(11).frames]
     assert rms(against) < 0.6 < rms([f.noise_pct for f in noisy(11).frames])
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from psfcore.gap.evidence.columns import FieldColumns
-from psfcore.gap.evidence.evidence import Evidence, gather
+from psfcore.gap.evidence.responses import Evidence, gather
 from psfcore.scatter.inversion import invert
 from psfcore.scatter.reconstruction import Solution
 from psfcore.simulate.plan import default_plan

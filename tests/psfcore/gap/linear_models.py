@@ -11,8 +11,8 @@ import pytest
 from psfcore.gap.effect import Effect
 from psfcore.gap.evidence import closed_form
 from psfcore.gap.evidence.cells import DiscCells
-from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
+from psfcore.gap.evidence.responses import Evidence
 from psfcore.gap.evidence.tree import SUN, Field
 from psfcore.gap.library.registry import LIBRARY
 

@@ -10,12 +10,12 @@ from unittest.mock import patch
 
 import numpy as np
 
-from psfcore.blind.leftover import true_coordinates
+from psfcore.blind.residuals import true_coordinates
 from psfcore.gap import corrected_psf
 from psfcore.gap.diagnose import Diagnosis, diagnose
 from psfcore.gap.effect import Effect
 from psfcore.gap.library.registry import LIBRARY
-from psfcore.gap.verdict import where
+from psfcore.gap.verdict import axes
 from psfcore.gap.view import View
 from psfcore.scatter import total_psf
 from psfcore.scatter.inversion import invert
@@ -34,7 +34,7 @@ FEW = tuple(one for one in LIBRARY if one.name in NAMES)
 
 def few_sign_flips() -> AbstractContextManager[object]:
     """A context in which a diagnosis makes 99 sign flips, which is quicker than 999."""
-    return patch.object(where, "SIGN_FLIPS", 99)
+    return patch.object(axes, "SIGN_FLIPS", 99)
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from psfcore.gap.diagnose import Diagnosis, caution_of_closure, diagnose
 from psfcore.gap.evidence.measured_noise import measured_noise
 from psfcore.gap.library.registry import LIBRARY
 from psfcore.gap.report.report import gap_report
-from psfcore.gap.verdict import where
+from psfcore.gap.verdict import axes
 from psfcore.gap.verdict.calibration import Calibration
 from psfcore.gap.verdict.limits import limits
 from psfcore.noise import Noise
@@ -33,7 +33,7 @@ FEW = tuple(effect for effect in small_gaps.FEW if effect.held is None)
 
 @pytest.fixture(autouse=True)
 def fewer_sign_flips(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(where, "SIGN_FLIPS", 99)
+    monkeypatch.setattr(axes, "SIGN_FLIPS", 99)
 
 
 @pytest.fixture(scope="module")

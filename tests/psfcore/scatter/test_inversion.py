@@ -104,7 +104,7 @@ def test_a_field_need_not_be_square() -> None:
     for scene in scenes.values():
         scene[105:] = 0.0
     of = true_sky(whole.plan, SCATTER, DIFFRACTION, 3, scenes=scenes)
-    transit = with_pixels(noise_free(whole), [plane[:105] for plane in of.noise_free])
+    transit = with_pixels(noise_free(whole), [of.expected(n)[:105] for n in range(len(of.plan.shots))])
     assert transit.shape == (105, SIZE_PX)
     assert np.abs(off(invert(transit).inversion)).max() < 0.01
 

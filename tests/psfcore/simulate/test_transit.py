@@ -193,7 +193,7 @@ def test_the_occulter_is_dark_in_the_true_scene_and_lit_by_scatter(small: Simula
     for index in range(6):
         dark = fully_dark(small.plan.place(index), (0, 0), (96, 96))
         assert true_scene(small.sky, index)[dark].max() < 1e-9
-        assert small.sky.noise_free[index][dark].min() > 0
+        assert small.sky.expected(index)[dark].min() > 0
         lit = covered_share(small.plan.place(index), (0, 0), (96, 96)) == 0
         pointing = small.plan.shots[index].pointing
         np.testing.assert_array_equal(true_scene(small.sky, index)[lit], small.sky.scenes[pointing][lit])
@@ -220,7 +220,7 @@ def test_noise_has_the_variance_of_photon_and_read_noise_and_repeats_its_seed() 
     pulls: dict[int, list[NDArray[np.float64]]] = {index: [] for index in range(6)}
     for seed in range(12):
         for index, frame in enumerate(observed_transit(sky, seed).transit.frames):
-            expected = sky.noise_free[index]
+            expected = sky.expected(index)
             sigma = np.sqrt(6.0 * expected * frame.exposure_s + 2.0**2) / frame.exposure_s
             pulls[index].append((frame.pixels - expected) / sigma)
     for found in pulls.values():
@@ -375,7 +375,7 @@ def test_a_folder_contains_the_transit_and_its_truth(tmp_path: Path) -> None:
     diffraction = fits.getdata(tmp_path / "t/diffraction.fits")
     np.testing.assert_allclose(diffraction, DIFFRACTION, rtol=1e-6, atol=1e-30)
     noise_free = fits.getdata(tmp_path / "t/noise_free/002.fits")
-    np.testing.assert_allclose(noise_free, simulated.sky.noise_free[2], rtol=1e-6)
+    np.testing.assert_allclose(noise_free, simulated.sky.expected(2), rtol=1e-6)
 
 
 def test_a_sky_is_read_back_and_a_folder_without_truth_is_refused(tmp_path: Path) -> None:
@@ -392,7 +392,7 @@ def test_a_sky_is_read_back_and_a_folder_without_truth_is_refused(tmp_path: Path
     for index in range(3):
         # Half pixels at the disc's edge are gone: what they hide differs a little, and only there.
         dark = fully_dark(plan.place(index), (0, 0), (64, 64))
-        ratio = sky.expected(index) / simulated.sky.noise_free[index]
+        ratio = sky.expected(index) / simulated.sky.expected(index)
         assert ratio[dark].mean() == pytest.approx(1, abs=0.02)
         share = covered_share(plan.place(index), (0, 0), (64, 64))
         scenes = [true_scene(of, index)[20:-20, 20:-20][share == 0] for of in (sky, simulated.sky)]

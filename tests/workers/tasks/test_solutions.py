@@ -147,7 +147,7 @@ def test_without_room_or_if_it_is_too_large_it_is_not_kept_and_the_job_goes_on(
     workspace: CatalogueWorkspace, inverted: list[Transit], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patched:
-        patched.setattr("psfcore.scatter.kept.MOST_BYTES", 1000)
+        patched.setattr("psfcore.scatter.solution_file.MOST_BYTES", 1000)
         solve(workspace)
     assert workspace.catalogue.owners.solutions_before(np.inf) == [] == list(workspace.store.blobs())
     image = ImageRow(owner="o", id="2" * 64, created_at=1.0, bytes=2**19, summary={})

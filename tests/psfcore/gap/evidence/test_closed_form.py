@@ -15,8 +15,8 @@ from scipy.stats import multivariate_normal
 
 from psfcore.gap.evidence.closed_form import SUN_COURSES, ClosedForm, Form, Inexact, Sun, Variant
 from psfcore.gap.evidence.columns import FieldColumns
-from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
+from psfcore.gap.evidence.responses import Evidence
 from psfcore.gap.evidence.tree import SUN, Field
 from tests.psfcore.gap.linear_models import (
     LIGHT,

@@ -18,8 +18,8 @@ from psfcore.gap.evidence.columns import (
     FieldColumns,
     with_effect,
 )
-from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
+from psfcore.gap.evidence.responses import Evidence
 from psfcore.gap.evidence.tree import Field, fields_of
 from psfcore.gap.evidence.unocculted_blocks import blocks
 from psfcore.gap.verdict.answer import answer_of
@@ -143,7 +143,7 @@ def test_columns_change_cells_and_blocks_as_their_pixels_do(
     coefficients = without_inner_rings(field, drawn, columns)
     view, k = View(solution), 4
     n = evidence.discs[k].index
-    scene = solution.optics.field(view.occulted_scene(n)).astype(np.float64)
+    scene = solution.optics.field(view.occulted_scenes[n]).astype(np.float64)
     cells, sensitivity = disc_cells(solution, n)
     moved = change(evidence, field, coefficients, n, view.expected[n], scene)
     direct = np.einsum("cyx,yx->c", sensitivity.astype(np.float64), moved)
@@ -174,7 +174,7 @@ def test_light_beside_the_field_and_at_the_edge_of_the_occulter(
     )
     # At the edge of a disc: patterns in units of its light, and of a tenth of the scene around it.
     disc, info = evidence.discs[4], evidence.image_info[evidence.discs[4].index]
-    scene = solution.optics.field(View(solution).occulted_scene(disc.index))
+    scene = solution.optics.field(View(solution).occulted_scenes[disc.index])
     y, x = np.indices(scene.shape)
     r = np.hypot(y - info.y_px, x - info.x_px) / np.sqrt(disc.pixels.sum() / np.pi)
     around = float(scene[(r > AROUND[0]) & (r < AROUND[1])].mean())

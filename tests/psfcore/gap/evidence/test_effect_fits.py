@@ -9,8 +9,8 @@ import pytest
 from scipy.stats import chi2
 
 from psfcore.gap.evidence.effect_fits import fit_effects, label_of, left_chi2, p_value_of_gap
-from psfcore.gap.evidence.evidence import Evidence, gather
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
+from psfcore.gap.evidence.responses import Evidence, gather
 from psfcore.gap.library.detector import EFFECTS
 from psfcore.scatter.reconstruction import Solution
 from tests.psfcore.gap.linear_models import (

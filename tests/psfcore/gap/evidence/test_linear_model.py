@@ -10,8 +10,8 @@ import scipy.linalg
 from scipy.stats import multivariate_normal
 
 from psfcore.gap.evidence.cells import cells_of, disc_cells, sensitivities
-from psfcore.gap.evidence.evidence import Evidence, gather
 from psfcore.gap.evidence.linear_model import FLOOR, UNLIKELY, LinearModel
+from psfcore.gap.evidence.responses import Evidence, gather
 from psfcore.gap.library.detector import EFFECTS
 from psfcore.gap.view import View
 from psfcore.scatter.reconstruction import Solution

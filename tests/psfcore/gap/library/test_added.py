@@ -15,7 +15,7 @@ from psfcore import gap
 from psfcore.errors import DataError
 from psfcore.gap.effect import Effect
 from psfcore.gap.effect_sources import sha256_of_source
-from psfcore.gap.evidence.evidence import gather
+from psfcore.gap.evidence.responses import gather
 from psfcore.gap.library.registry import LIBRARY, added_effects, library_with
 from tests.gap_files import EDGE_GLOW as GLOW
 from tests.psfcore.gap.small_gaps import solution, view

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from psfcore.gap.evidence.closed_form import SUNS, ClosedForm, Form, Variant
-from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
+from psfcore.gap.evidence.responses import Evidence
 from psfcore.gap.evidence.tree import FAMILIES, SUN, Field
 from psfcore.gap.verdict import answer as answers
 from psfcore.gap.verdict.answer import (

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
+from psfcore.gap.evidence.responses import Evidence
+from psfcore.gap.verdict.axes import ranked_axes, shapley
 from psfcore.gap.verdict.closure import FORM_ERROR, HeldOut, closure, fall, gap, hold_out, time_blocks
-from psfcore.gap.verdict.where import shapley, where
 from tests.psfcore.gap.linear_models import discs_only, with_left, with_residuals
 
 
@@ -116,7 +116,7 @@ def test_shares_of_axes_are_averages_over_orders_and_the_axis_of_a_gap_is_first(
     assert shares == pytest.approx({"a": 0.75, "b": 1.75})  # (1 + 0.5) / 2 and (2 + 1.5) / 2
     noise = with_residuals(evidence, {}, noise=1.0)
     rings = with_left(noise, lambda disc: disc.residual + 0.5 * disc.expected * (disc.radius - 0.6))
-    axes, of_noise = (where(model, np.random.default_rng(1)) for model in (rings, noise))
+    axes, of_noise = (ranked_axes(model, np.random.default_rng(1)) for model in (rings, noise))
     assert axes[0].name == "radius_in_disc" and axes[0].share > 0.4
     assert sum(axis.share for axis in axes) == pytest.approx(1.0)
     # Of nine discs, few sign flips differ.

@@ -14,8 +14,8 @@ from scipy.ndimage import gaussian_filter
 from psfcore.errors import DataError
 from psfcore.gap.effect import Change, Effect
 from psfcore.gap.evidence.effect_fits import fit_effects
-from psfcore.gap.evidence.evidence import Evidence, gather
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
+from psfcore.gap.evidence.responses import Evidence, gather
 from psfcore.gap.evidence.search import displaced
 from psfcore.gap.verdict import correction
 from psfcore.gap.verdict.correction import add_to_model, images_without

@@ -11,8 +11,8 @@ import pytest
 from scipy.stats import norm
 
 from psfcore.gap.evidence.closed_form import ClosedForm
-from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
+from psfcore.gap.evidence.responses import Evidence
 from psfcore.gap.verdict.answer import FLOOR as FLOOR_OF_NONE
 from psfcore.gap.verdict.answer import NONE, ONE, prior_of
 from psfcore.gap.verdict.limits import ALIKE, EffectLimits, Limits, ParameterLimits, limits, upper_limit

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from psfcore.errors import DataError
-from psfcore.scatter import kept
+from psfcore.scatter import solution_file
 from psfcore.scatter.inversion import solution_of
-from psfcore.scatter.kept import read_solution, write_solution
 from psfcore.scatter.reconstruction import Solution
 from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW
+from psfcore.scatter.solution_file import read_solution, write_solution
 from psfcore.transit.transit import Transit
 from tests.psfcore.small_transits import observed, sky, solved, solved_noise_free
 
@@ -77,7 +77,7 @@ def refusal(path: Path, transit: Transit | None = None) -> str:
 
 
 def test_a_file_too_large_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(kept, "MOST_BYTES", 2**10)
+    monkeypatch.setattr(solution_file, "MOST_BYTES", 2**10)
     with pytest.raises(DataError) as caught:
         write_solution(tmp_path / "large", solved())
     assert caught.value.code == "solution-too-large" and list(tmp_path.iterdir()) == []

@@ -40,11 +40,11 @@ class EffectFree:
 
     @cached_property
     def lights(self) -> list[NDArray[np.float32]]:
-        """The light of every image in the focal plane, on fine pixels [y, x], DN/s; computed once for many chains."""
+        """The light of every image in the focal plane, on fine pixels [y, x], DN/s; computed once for many simulations."""
         return [light.astype(np.float32) for light in focal_planes(self, ())]
 
 
-class Chain:
+class Simulation:
     """The simulation of the images of a plan with a set of effects. Each result is computed once and kept.
 
     seed: the seed of the noise. headroom: the level at which high-only images clip, divided by the brightest pixel,
@@ -57,9 +57,9 @@ class Chain:
         self.clean, self.plan, self.effects, self.seed = clean, clean.plan, tuple(effects), seed
         self.headroom = headroom
 
-    def with_effects(self, *effects: Effect) -> Chain:
+    def with_effects(self, *effects: Effect) -> Simulation:
         """The same simulation with other effects."""
-        return Chain(self.clean, effects, self.seed, self.headroom)
+        return Simulation(self.clean, effects, self.seed, self.headroom)
 
     @cached_property
     def rates(self) -> list[Plane]:

@@ -23,8 +23,8 @@ import numpy as np
 from scipy.special import chdtrc
 
 from psfcore.gap.evidence.cells import DiscCells
-from psfcore.gap.evidence.evidence import Evidence, ImageInfo
 from psfcore.gap.evidence.linear_model import LinearModel, Step
+from psfcore.gap.evidence.responses import Evidence, ImageInfo
 from psfcore.gap.view import Matrix, Vector
 
 SIGN_FLIPS = 999
@@ -60,7 +60,7 @@ class Axis:
         }
 
 
-def where(
+def ranked_axes(
     model: LinearModel, rng: np.random.Generator, favoured: Sequence[str] = (), explained: Step | None = None
 ) -> tuple[Axis, ...]:
     """All axes, the strongest first. Significant axes come before the others; then the share decides.

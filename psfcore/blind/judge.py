@@ -1,4 +1,4 @@
-"""A diagnosed case of a blind set: its true causes, its report, and whether the report is right.
+"""The judge of a diagnosed case of a blind set: its true causes, its report, and whether the report is right.
 
 **Entries.** A report states one entry for each cause that it claims (`causes`), and none if it finds no gap. The
 alternatives of an entry are the causes of which one acts with 90 %. An alternative names a stage, a family, and an
@@ -29,42 +29,62 @@ this difference counts as an error of the diagnosis.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from psfcore.blind.case_set import BlindSet
+from psfcore.blind.run_set import BOUND_SCHEMA, REPORT_SCHEMA, result_in, run_of
+
 Entry = Mapping[str, Any]  # an entry of a report, or one of its alternatives
 
 NAME, FAMILY, STAGE = LEVELS = ("name", "family", "stage")
 HIDDEN, OPEN, ISOLABLE = CLASSES = ("hidden", "open", "isolable")
 DETECTED, ISOLATED = 0.5, 0.8
-NONE = "none"  # the verdict of a report without a gap
+
+_DETECTOR = ("detector_x", "detector_y")
+# The axes along which each effect varies. `saturation_fill` has no entry: it depends on exposure and on the Sun's
+# brightness.
+AXES: dict[str, tuple[str, ...]] = {
+    "dark_offset": ("exposure", "intensity"),
+    "nonlinearity": ("intensity",),
+    "gain_mismatch": ("gain_mode", "exposure"),
+    **dict.fromkeys(("intensity_gradient", "flat_field_residual", "field_dependent_scatter"), _DETECTOR),
+    **dict.fromkeys(("column_smear", "ghost"), (*_DETECTOR, "intensity")),
+    **dict.fromkeys(("persistence", "scene_evolution"), ("time", "pointing")),
+    **dict.fromkeys(("anisotropic_scatter", "mesh_rotation"), ("azimuth_in_disc", *_DETECTOR)),
+    **dict.fromkeys(("wide_halo", "out_of_field_light"), ("scattering_distance", "pointing", "intensity")),
+    **dict.fromkeys(("core_blur", "mesh_pitch", "occulter_motion"), ("radius_in_disc", "azimuth_in_disc")),
+}
+# Effects whose strength is a parameter of the library: the name of this parameter.
+COMPARABLE = {
+    "dark_offset": "offset",
+    "intensity_gradient": "level",
+    "gain_mismatch": "excess",
+    "ghost": "share",
+    "wide_halo": "share",
+    "mesh_rotation": "angle",
+}
 
 
 @dataclass(frozen=True, eq=False)
 class Cause:
-    """A true cause of a case: cause `number` of `case`.
+    """A true cause of a case.
 
     effect: its entry in the truth. bound: its entry in bound.json; None if the bound was not computed.
     """
 
-    case: Judged
-    number: int
+    case: DiagnosedCase
     effect: dict[str, Any]
     bound: dict[str, Any] | None
 
     @property
-    def name(self) -> str:
-        """The name of the effect."""
-        return str(self.effect["name"])
-
-    @property
     def is_known(self) -> bool:
         """Whether the gap library contains the effect in this form."""
-        return bool(self.effect["cause"] == self.name)
+        return bool(self.effect["cause"] == self.effect["name"])
 
     @property
     def is_only(self) -> bool:
@@ -97,21 +117,34 @@ class Cause:
             and (len(entry["alternatives"]) == 1 if level == NAME else entry["alternatives"])
         ]
 
-    def is_covered_by(self, entry: Entry) -> bool:
-        """Whether an entry covers the cause."""
-        if entry["level"] == STAGE and entry in self.right_entries(STAGE):
-            return True
-        return any(self.matches(one, level) for one in entry["alternatives"] for level in (NAME, FAMILY))
-
     @property
     def cover(self) -> Entry | None:
         """The first entry that covers the cause; None if there is none."""
-        return next(filter(self.is_covered_by, self.case.entries), None)
+        right = self.right_entries(STAGE)
+        for entry in self.case.entries:
+            alike = (self.matches(one, level) for one in entry["alternatives"] for level in (NAME, FAMILY))
+            if (entry["level"] == STAGE and entry in right) or any(alike):
+                return entry
+        return None
 
     @property
-    def answer(self) -> Entry | None:
-        """The entry that covers the cause, else the first entry; None if the report has no entry."""
-        return self.cover or next(iter(self.case.entries), None)
+    def is_below_limit(self) -> bool | None:
+        """Whether the true strength is at most the excluded_95 of the report; None if the two cannot be compared."""
+        parameter = COMPARABLE.get(self.effect["name"])
+        limit = self.case.report.get("limits", {}).get(self.effect["name"], {})
+        own = limit if limit.get("parameter") == parameter else limit.get("parameters", {}).get(parameter, {})
+        excluded = own.get("excluded_95")
+        return (
+            None if parameter is None or excluded is None else bool(abs(self.effect["strength"]) <= excluded)
+        )
+
+    @property
+    def is_on_axis(self) -> bool | None:
+        """Whether the gap of the report varies most along an axis of the effect; None if the case has another cause too,
+        or the effect has no axis."""
+        strongest = (self.case.report.get("where") or [{}])[0].get("axis")
+        axes = AXES.get(self.effect["name"])
+        return None if axes is None or not self.is_only else strongest in axes
 
     @property
     def closure(self) -> tuple[float, float, float, float] | None:
@@ -144,9 +177,21 @@ class Cause:
         correlation = float(np.corrcoef(true, values)[0, 1]) if both_vary else 0.0
         return float(np.hypot(*way)) / (size_px / 2), correlation
 
+    def as_json(self) -> dict[str, Any]:
+        """The judgement of the cause, as JSON."""
+        return {
+            **{key: self.effect[key] for key in ("name", "families", "strength", "left_alone_pct")},
+            "class": self.visibility,
+            "bound": self.bound,
+            "covered": self.cover is not None,
+            "right": {level: bool(self.right_entries(level)) for level in LEVELS},
+            "map": self.map,
+            "closure": self.closure,
+        }
+
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class DiagnosedCase:
     """One case: its truth, its report (gap/3), the wall time of its diagnosis, and its bound (gap-bound/1)."""
 
     number: int
@@ -159,8 +204,7 @@ class Judged:
     def causes(self) -> tuple[Cause, ...]:
         """The true causes; none for clean data."""
         bounds = [None] * len(self.truth["effects"]) if self.bound is None else self.bound["causes"]
-        both = zip(self.truth["effects"], bounds, strict=True)
-        return tuple(Cause(self, n, effect, bound) for n, (effect, bound) in enumerate(both))
+        return tuple(Cause(self, *both) for both in zip(self.truth["effects"], bounds, strict=True))
 
     @property
     def entries(self) -> list[Entry]:
@@ -184,10 +228,19 @@ class Judged:
         first, second = (cause.right_entries(FAMILY) for cause in self.causes)
         return any(one is not other for one in first for other in second)
 
-    @property
-    def strongest_axis(self) -> str | None:
-        """The axis along which the gap of the report varies most; None if the report states none."""
-        return (self.report.get("where") or [{}])[0].get("axis")
+    def as_json(self) -> dict[str, Any]:
+        """The judgement of the case, as JSON."""
+        return {
+            "case": self.number,
+            "kind": self.truth["kind"],
+            "verdict": self.report["verdict"],
+            "entries": [
+                {key: entry[key] for key in ("level", "words", "alternatives")} for entry in self.entries
+            ],
+            "wrong_alone": self.wrong_alone,
+            "wall_s": self.wall_s,
+            "causes": [cause.as_json() for cause in self.causes],
+        }
 
 
 def true_closure(truth: Mapping[str, Any]) -> float | None:
@@ -196,3 +249,22 @@ def true_closure(truth: Mapping[str, Any]) -> float | None:
     noise = np.array([one["noise_pct"] for one in truth["residuals"]])
     with_effect, without_effect = np.sum((percents.reshape(-1, 2) / noise[:, None]) ** 2, axis=0)
     return float(1 - without_effect / with_effect) if with_effect else None
+
+
+def diagnosed_cases(
+    blind_set: BlindSet, numbers: Sequence[int]
+) -> tuple[list[DiagnosedCase], dict[int, str]]:
+    """Two results: the cases that have a report; the reasons why the other cases have none, by number.
+
+    Each truth is read, and its seal is checked. Raises DataError "broken-seal", "bad-seals".
+    """
+    cases, failures = [], {}
+    for number in numbers:
+        truth, run = blind_set.truth(number), run_of(blind_set, number)
+        report = result_in(blind_set.report(number), REPORT_SCHEMA)
+        if report is None:
+            failures[number] = (run.error if run else "") or "no complete report"
+        else:
+            bound = result_in(blind_set.bound(number), BOUND_SCHEMA)
+            cases.append(DiagnosedCase(number, truth, report, run.wall_s if run else 0.0, bound))
+    return cases, failures

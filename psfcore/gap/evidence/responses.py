@@ -162,7 +162,7 @@ def gather(
         if n in part:
             discs.append(disc_with_jacobian(view, n, changes))
             dark = solution.sky.dark[n]
-            far = moved.field(moved.convolve(view.occulted_scene(n)))[dark].mean()
+            far = moved.field(moved.convolve(view.occulted_scenes[n]))[dark].mean()
             light = max(float(view.expected[n][dark].mean()), 1e-9)
             info = replace(info, scattering_distance_px=float(far / light))
         infos.append(info)
@@ -205,7 +205,7 @@ def disc_with_jacobian(view: View, n: int, changes: Sequence[Change]) -> DiscCel
     solution = view.solution
     cells, planes = disc_cells(solution, n)
     flat = planes.reshape(planes.shape[0], -1)
-    scene = view.occulted_scene(n)
+    scene = view.occulted_scenes[n]
     slopes = (slope.field(slope.convolve(scene)) for slope in view.slopes)
     fields = itertools.chain(slopes, (change.change(n, view.expected) for change in changes))
     jacobian = np.zeros((len(view.slopes) + len(changes), flat.shape[0]))
@@ -233,28 +233,28 @@ def residuals_at(
     the columns after the base that are kept; changes: the changes that belong to them, for discs whose cells have moved.
     The result has no effects. Discs that `evidence` lacks are left out.
     """
-    kept = [*evidence.base, *columns]
+    rows = [*evidence.base, *columns]
     part = set(view.solution.part)
-    unocculted = unocculted_blocks(view, len(kept), progress)
-    unocculted.errors[:] = evidence.unocculted.errors[kept]
+    unocculted = unocculted_blocks(view, len(rows), progress)
+    unocculted.errors[:] = evidence.unocculted.errors[rows]
     return replace(
         evidence,
         effects=(),
         columns={},
         untestable={},
-        discs=tuple(_disc_at(view, disc, kept, changes) for disc in evidence.discs if disc.index in part),
+        discs=tuple(_disc_at(view, disc, rows, changes) for disc in evidence.discs if disc.index in part),
         unocculted=unocculted,
     )
 
 
-def _disc_at(view: View, disc: DiscCells, kept: Sequence[int], changes: Sequence[Change]) -> DiscCells:
+def _disc_at(view: View, disc: DiscCells, rows: Sequence[int], changes: Sequence[Change]) -> DiscCells:
     other = view.solution
     place = other.sky.found[disc.index].place
     cells = cells_of(other.sky.dark[disc.index], place.x_px, place.y_px)
     if cells.pixels.size != disc.pixels.size:  # its outermost dark pixels moved
         return disc_with_jacobian(view, disc.index, changes)
     residual, expected = other.residual(disc.index)
-    jacobian = disc.jacobian[list(kept)]
+    jacobian = disc.jacobian[list(rows)]
     for k, slope in enumerate(view.slopes):
         jacobian[k] = cells.weights @ other.jacobian(disc.index, slope)
     return replace(
