@@ -547,7 +547,7 @@ class Local(Operations):
             {"details": report.details},
             file=lambda path: write_json(path, report.content),
             preview=report.draw,
-            html=lambda path: path.write_text(report.page(), "utf-8"),
+            html=lambda path: path.write_text(report.page().html, "utf-8"),
         )
 
     def _add(self, address: str, described: dict[str, Any], **files: Callable[[Path], object]) -> str:

@@ -60,6 +60,12 @@ MOST_RERUNS = 10
 OF_OPTIONS = (404, 409, 413, 422)
 TO_ALLOW = ("channel-mismatch", "already-deconvolved", "psf-as-image")
 SURE = "If you are sure, allow it below."
+# Swagger UI loads its icons from data: addresses in its style sheet, and its scripts set styles.
+REFERENCE_HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:; "
+    "connect-src 'self'; frame-ancestors 'none'; base-uri 'none'",
+    "Referrer-Policy": "no-referrer",
+}
 START, OPEN, CHECK = "Start", "Open the product", "Check and start"
 router = APIRouter(include_in_schema=False)
 products = APIRouter(prefix="/products/{product_id}", include_in_schema=False)
@@ -81,6 +87,12 @@ def home(request: Request, caller: PageReading, state: Shared) -> Response:
             [JobView.of(row) for row in catalogue.page(JobRow, owner=owner, limit=LATEST)], caller, state
         ),
     )
+
+
+@router.get("/docs")
+def docs(request: Request) -> Response:
+    """The interactive reference of the API, which is open to everybody."""
+    return page(request, "docs.html", headers=REFERENCE_HEADERS)
 
 
 @router.post("/images")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, get_args
 
 from fastapi import APIRouter, Query, Request, Response
@@ -36,17 +36,7 @@ from service.http.problems import Problem
 from service.http.state import Shared, State
 from service.pages.forms import SentForm, checked, filled, parameters, start_job, text, wrong_fields
 from service.pages.login import PageCertifying, PageReading, PageSubmitting
-from service.pages.plots import (
-    Plot,
-    Series,
-    fit_parameters,
-    fit_plots,
-    light_beyond_plot,
-    radial_plot,
-    shown_radii,
-    with_errors,
-)
-from service.pages.rendering import number, page, short
+from service.pages.rendering import dense, differing, flat, number, page, short
 from service.views import PsfView
 from workers.catalogue.access import Scope
 from workers.catalogue.psfs import PsfFilter
@@ -139,12 +129,10 @@ def psf(psf_id: Identity, request: Request, caller: PageReading, state: Shared) 
         facts=psf_facts(view),
         status_view=status,
         series=_series(state, caller, status.series),
-        plots=[] if tables is None else _plots(tables),
-        resolution=None if tables is None else lookup.curve(tables)["resolution"],
+        profile=None if tables is None else lookup.profile(tables),
+        curve=None if tables is None else lookup.curve(tables),
         no_tables=told,
         fit=fit,
-        fit_values=[] if fit is None else fit_parameters(fit),
-        fit_plots=[] if fit is None else fit_plots(fit),
         lineage=get_psf_lineage(psf_id, caller, state),
         others=[one for one in others if one.id != psf_id][:MOST_OTHERS],
         rivals=_rivals(state, caller, view),
@@ -252,11 +240,6 @@ def validity(psf: PsfView) -> str:
     return f"from {psf.valid_from or 'the beginning'} to {psf.valid_to or 'now and later'}"
 
 
-def profile_series(label: str, profile: Mapping[str, Any], name: str, places: list[int]) -> Series:
-    """The mean weight of one component at each radius. If the PSF was fitted, the errors are included."""
-    return with_errors(label, profile["mean_weight"][name], profile["sigma"].get(name), places)
-
-
 def _tables(state: State, caller: Caller, psf_id: str) -> tuple[Tables | None, str | None]:
     """Two results: the tables, and None; or None, and the reason why the PSF has no tables."""
     try:
@@ -265,21 +248,6 @@ def _tables(state: State, caller: Caller, psf_id: str) -> tuple[Tables | None, s
         if problem.code != "no-tables":
             raise
         return None, problem.detail
-
-
-def _plots(tables: Tables) -> list[Plot]:
-    curve, profile = lookup.curve(tables), lookup.profile(tables)
-    sigma = curve["sigma_points"]
-    beyond = {name: (pct, sigma.get(name)) for name, pct in curve["light_beyond_pct"].items()}
-    radii, names = profile["radius_px"], profile["mean_weight"]
-    places = shown_radii(radii)
-    rings = radial_plot(
-        "Mean weight by radius",
-        "mean weight of a pixel",
-        [radii[at] for at in places],
-        [profile_series(name, profile, name, places) for name in names],
-    )
-    return [rings, light_beyond_plot(curve["radii_px"], beyond)]
 
 
 def _series(state: State, caller: Caller, name: str | None) -> SeriesView | None:
@@ -343,11 +311,10 @@ def comparison(
     one, other = get_psf(psf_id, caller, state), get_psf(other_id, caller, state)
     labels = _labels(one, other)
     (first, why), (second, other_why) = (_tables(state, caller, identity) for identity in (psf_id, other_id))
-    plots, figures, told = [], None, why or other_why
+    compared, told = None, why or other_why
     if first is not None and second is not None:
         try:
-            figures = lookup.compare(first, second)
-            plots = _compared_plots(labels, first, second)
+            compared = _compared(first, second)
         except DataError as error:
             told = error.message
     return page(
@@ -356,19 +323,25 @@ def comparison(
         one=one,
         other=other,
         labels=labels,
-        plots=plots,
-        figures=figures,
         told=told,
-        differences=differences(one, other),
+        differences=differing(psf_parameters(one), psf_parameters(other)),
+        compared=compared,
     )
 
 
-def differences(one: PsfView, other: PsfView) -> list[tuple[str, str, str]]:
-    """The facts and parameters that differ: name, and the value of each PSF ("-": it has none)."""
-    first, second = _parameters(one), _parameters(other)
-    names = [*first, *(name for name in second if name not in first)]
-    rows = [(name, first.get(name, "-"), second.get(name, "-")) for name in names]
-    return [row for row in rows if row[1] != row[2]]
+def _compared(one: Tables, other: Tables) -> dict[str, Any]:
+    """The curves of two PSFs at the radii that both have, and their differences. Raises DataError "plate-scale-mismatch"."""
+    figures, both = lookup.compare(one, other), (one, other)
+    profiles = [lookup.profile(tables) for tables in both]
+    means = [profile["mean_weight"][lookup.TOTAL] for profile in profiles]
+    shown = [figures["radii_px"][at] for at in dense(figures["radii_px"])]
+    return {
+        "figures": figures,
+        "profiles": profiles,
+        "radii": min((profile["radius_px"] for profile in profiles), key=len),
+        "ratios": [b / a if a > 0 else None for a, b in zip(*means, strict=False)],
+        "curves": [lookup.curve(tables, shown) for tables in both],
+    }
 
 
 def _labels(one: PsfView, other: PsfView) -> tuple[str, str]:
@@ -379,7 +352,8 @@ def _labels(one: PsfView, other: PsfView) -> tuple[str, str]:
     return first, second
 
 
-def _parameters(psf: PsfView) -> dict[str, str]:
+def psf_parameters(psf: PsfView) -> dict[str, str]:
+    """The facts and parameters by which PSFs are compared: name and value."""
     facts = {name: said for name, said in psf_facts(psf) if name != "Id"}
     made = dict(psf.details.get("provenance") or {})
     fitted = (psf.details.get("fit") or {}).get("parameters") or {}
@@ -391,8 +365,8 @@ def _parameters(psf: PsfView) -> dict[str, str]:
         "Status": str(psf.status),
         **facts,
         **{f"fit: {name}": said for name, said in fit.items()},
-        **dict(_flat(told)),
-        **{f"instrument file: {name}": said for name, said in _flat(_instrument(made))},
+        **flat(told),
+        **{f"instrument file: {name}": said for name, said in flat(_instrument(made)).items()},
     }
 
 
@@ -400,56 +374,3 @@ def _instrument(made: Mapping[str, Any]) -> dict[str, Any]:
     """The content of the instrument file from which a PSF was built; empty if there is none."""
     text = made.get("instrument_toml")
     return parse_toml(text) if isinstance(text, str) else {}
-
-
-def _flat(values: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str]]:
-    """Nested values as pairs of name and text. The name contains all levels, separated by dots."""
-    for key, value in values.items():
-        name = f"{before}{key}"
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{name}.")
-        elif isinstance(value, list) and value and all(isinstance(item, Mapping) for item in value):
-            for place, item in enumerate(value, start=1):
-                yield from _flat(item, f"{name} {item.get('name', place)}.")
-        elif value is not None:
-            yield name, str(value)
-
-
-def _compared_plots(labels: tuple[str, str], one: Tables, other: Tables) -> list[Plot]:
-    profiles = [lookup.profile(tables) for tables in (one, other)]
-    rings = min(len(profile["radius_px"]) for profile in profiles)
-    places = shown_radii(profiles[0]["radius_px"][:rings])
-    radii = [profiles[0]["radius_px"][at] for at in places]
-    curves = [
-        profile_series(label, profile, lookup.TOTAL, places)
-        for label, profile in zip(labels, profiles, strict=True)
-    ]
-    means = [profile["mean_weight"][lookup.TOTAL] for profile in profiles]
-    ratios = [means[1][at] / means[0][at] if means[0][at] > 0 else None for at in places]
-    title = f"Ratio of the mean weights: {labels[1]} / {labels[0]}"
-    return [
-        radial_plot("Mean weight by radius", "mean weight of a pixel", radii, curves),
-        radial_plot(title, "ratio", radii, [Series("ratio", ratios)], y_log=False),
-        *_light_plots(labels, one, other),
-    ]
-
-
-def _light_plots(labels: tuple[str, str], one: Tables, other: Tables) -> list[Plot]:
-    """The light beyond each radius that both tables have, and the difference."""
-    compared = lookup.compare(one, other)
-    places = shown_radii(compared["radii_px"])
-    radii = [compared["radii_px"][at] for at in places]
-    found = [lookup.curve(tables, radii) for tables in (one, other)]
-    curves = {
-        label: (curve["light_beyond_pct"][lookup.TOTAL], curve["sigma_points"].get(lookup.TOTAL))
-        for label, curve in zip(labels, found, strict=True)
-    }
-    points, sigma = compared["difference_points"][lookup.TOTAL], compared["sigma_points"].get(lookup.TOTAL)
-    difference = radial_plot(
-        f"Difference of the light beyond a radius: {labels[1]} minus {labels[0]}",
-        "percentage points",
-        radii,
-        [with_errors("difference", points, sigma, places)],
-        y_log=False,
-    )
-    return [light_beyond_plot(radii, curves), difference]

@@ -17,6 +17,7 @@ from workers.settings import library_versions, software_version
 from workers.versions import TOTAL, PsfStatus, channel_of, series_of
 
 if TYPE_CHECKING:
+    from psfcore.drawing.page import Page
     from psfcore.scatter.inversion import Inverter, Progress
     from workers.catalogue.tables import PsfRow
     from workers.files.store import Store
@@ -133,7 +134,7 @@ class Finished:
     content: dict[str, Any]
     details: dict[str, Any]
     draw: Callable[[Path], object]
-    page: Callable[[], str] | None = None
+    page: Callable[[], Page] | None = None
 
 
 def provenance_of(job_id: str, request: Parameters) -> dict[str, Any]:
@@ -158,23 +159,33 @@ def report_made(context: Context, identity: str) -> bool:
 
 def keep_report(context: Context, identity: str, kind: str, report: Finished, *, transit_id: str) -> None:
     """Write the files of a report on a transit into the store, and add its row to the catalogue."""
-    store = context.store
-    with store.temporary() as text, store.temporary() as page, store.temporary() as picture:
+    with context.store.temporary() as text, context.store.temporary() as picture:
         write_json(text, report.content)
         report.draw(picture)
-        of_page = {}
-        if report.page is not None:
-            page.write_text(report.page(), "utf-8")
-            of_page = {"page_sha256": store.keep(page)}
         add_report(
             context,
             identity,
             kind,
             text=text,
-            details=report.details | of_page,
-            preview_sha256=store.keep(picture),
+            details=report.details | ({} if report.page is None else keep_page(report.page(), context.store)),
+            preview_sha256=context.store.keep(picture),
             transit_id=transit_id,
         )
+
+
+def keep_page(page: Page, store: Store) -> dict[str, Any]:
+    """Write the page of a report into the store, its texts and its figures; returns the details that name these files."""
+
+    def keep(content: bytes) -> str:
+        with store.temporary() as path:
+            path.write_bytes(content)
+            return store.keep(path)
+
+    return {
+        "page_sha256": keep(page.html.encode()),
+        "page_texts_sha256": keep(json.dumps(page.texts).encode()),
+        "figures_sha256": [keep(png) for png in page.figures],
+    }
 
 
 def add_report(

@@ -17,25 +17,28 @@ from workers.catalogue.tables import DEFAULT_OWNER
 from workers.files.store import Store
 from workers.settings import Settings
 from workers.tasks.context import Context
-from workers.tasks.results import add_report, write_json
+from workers.tasks.results import add_report, keep_page, write_json
 
 GAP_ID = "9a" * 32
 
 
-def keep_gap_report(settings: Settings, owner: str = DEFAULT_OWNER) -> dict[str, Any]:
-    """Add the report GAP_ID of an owner to the catalogue, as the job gap-diagnose does; returns its JSON."""
+def keep_gap_report(settings: Settings, owner: str = DEFAULT_OWNER, *, old: bool = False) -> dict[str, Any]:
+    """Add the report GAP_ID of an owner to the catalogue, as the job gap-diagnose does; returns its JSON.
+
+    old: as a version did that kept the page in one file alone.
+    """
     found = small_gaps.found()
     said = gap_report(found)
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(plot, "PLOT_DPI", 40)  # quicker to draw
-        html = gap_page(found, said)
+        drawn = gap_page(found, said)
     catalogue, store = Catalogue(settings.catalogue_url), Store(settings.data_dir)
     context = cast(Context, SimpleNamespace(owner=owner, store=store, add=catalogue.add))
-    with store.temporary() as text, store.temporary() as page:
+    named = keep_page(drawn, store)
+    with store.temporary() as text:
         write_json(text, said)
-        page.write_text(html, "utf-8")
-        details = {"sentence": said["sentence"], "page_sha256": store.keep(page)}
-        add_report(context, GAP_ID, "gap", text=text, details=details)
+        files = {"page_sha256": named["page_sha256"]} if old else named
+        add_report(context, GAP_ID, "gap", text=text, details={"sentence": said["sentence"], **files})
     catalogue.close()
     return said
 

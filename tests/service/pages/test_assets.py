@@ -62,7 +62,7 @@ def test_a_package_of_others_names_its_version_licence_and_origin() -> None:
 
 def imported_by(name: str) -> set[str]:
     """The scripts that a script imports, at once or later."""
-    text = assets.assets()[name].plain.decode()
+    text = assets.assets()[name].read_text("utf-8")
     return set(re.findall(r'(?:from|import)\s*\(?\s*"\./([\w.-]+)"', text))
 
 
@@ -96,7 +96,7 @@ def test_each_file_is_used_by_a_page() -> None:
 def test_the_scripts_and_styles_of_a_page_are_light() -> None:
     of_others = set(vendored())
     for template in TEMPLATES:
-        size = {name: len(assets.assets()[name].zipped) for name in loaded_by(template)}
+        size = {name: len(gzip.compress(assets.assets()[name].read_bytes())) for name in loaded_by(template)}
         for suffix, most in ((".css", CSS), (".js", OWN_SCRIPTS)):
             own = [size[name] for name in size.keys() - of_others if name.endswith(suffix)]
             assert sum(own) <= most, template
