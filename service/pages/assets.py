@@ -29,7 +29,7 @@ class _Files(StaticFiles):
     """Files with the headers by which browsers keep them: for ever under the present version, and else not unasked."""
 
     def file_response(
-        self, full_path: PathLike[str], stat_result: stat_result, scope: Scope, status_code: int = 200
+        self, full_path: str | PathLike[str], stat_result: stat_result, scope: Scope, status_code: int = 200
     ) -> Response:
         """The answer with a file. It has no ETag, because answers with an ETag differ from caller to caller."""
         answer = super().file_response(full_path, stat_result, scope, status_code)
