@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Annotated, Any, get_args
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import RedirectResponse
-from pydantic import ValidationError, validate_call
 from starlette.datastructures import FormData
 
 from psfcore.errors import DataError
@@ -34,7 +33,7 @@ from service.http.gate import in_turn
 from service.http.paging import Cursor, Listing
 from service.http.problems import Problem
 from service.http.state import Shared, State
-from service.pages.forms import SentForm, checked, filled, parameters, start_job, text, wrong_fields
+from service.pages.forms import SentForm, checked, filled, parameters, start_job, text
 from service.pages.login import PageCertifying, PageReading, PageSubmitting
 from service.pages.rendering import dense, differing, flat, number, page, short
 from service.views import PsfView
@@ -53,14 +52,14 @@ FILTERS = ("instrument", "channel", "kind", "name", "version", "status", "valid_
 NOT_PARAMETERS = ("psf_id", "job_id", "file", "history", "instrument_toml")
 Tables = Mapping[str, Any]
 router = APIRouter(prefix="/psfs", include_in_schema=False)
-_filter: Callable[..., PsfFilter] = validate_call(psf_filter)
 
 
 @router.get("")
 def psf_list(request: Request, caller: PageReading, state: Shared, cursor: Cursor = None) -> Response:
     """PSFs, newest first, with the filters of the API."""
     asked = _asked(request)
-    found = list_psfs(Listing(request, PER_PAGE, cursor), caller, state, _wanted(asked), asked.get("context"))
+    wanted: PsfFilter = checked(psf_filter, {name: asked[name] for name in FILTERS if name in asked})
+    found = list_psfs(Listing(request, PER_PAGE, cursor), caller, state, wanted, asked.get("context"))
     return page(
         request,
         "psfs.html",
@@ -103,14 +102,6 @@ def _asked(request: Request) -> dict[str, str]:
     return {name: text for name in names if (text := request.query_params.get(name, "").strip())}
 
 
-def _wanted(asked: dict[str, str]) -> PsfFilter:
-    """The filter of the catalogue. Raises ``Problem`` 422 for a wrong value."""
-    try:
-        return _filter(**{name: asked[name] for name in FILTERS if name in asked})
-    except ValidationError as error:
-        raise wrong_fields(error, PsfFilter) from error
-
-
 # --- a PSF ------------------------------------------------------------------------------------------------
 
 
@@ -119,7 +110,7 @@ def psf(psf_id: Identity, request: Request, caller: PageReading, state: Shared) 
     """The PSF. Without tables it has no curves; a form then starts the job that makes them."""
     view = get_psf(psf_id, caller, state)
     tables, told = _tables(state, caller, psf_id)
-    fit = _fit(state, view)
+    report_sha256 = view.details.get("report_sha256")
     others = state.catalogue.psfs.page(PsfFilter(), caller.owner, limit=MOST_OTHERS + 1)
     status = get_psf_status(psf_id, caller, state)
     return page(
@@ -132,7 +123,7 @@ def psf(psf_id: Identity, request: Request, caller: PageReading, state: Shared) 
         profile=None if tables is None else lookup.profile(tables),
         curve=None if tables is None else lookup.curve(tables),
         no_tables=told,
-        fit=fit,
+        fit=None if report_sha256 is None else json_of(state.store, report_sha256),
         lineage=get_psf_lineage(psf_id, caller, state),
         others=[one for one in others if one.id != psf_id][:MOST_OTHERS],
         rivals=_rivals(state, caller, view),
@@ -265,14 +256,6 @@ def _series(state: State, caller: Caller, name: str | None) -> SeriesView | None
         return None
 
 
-def _fit(state: State, view: PsfView) -> dict[str, Any] | None:
-    """The report on the fit; None if the PSF was not fitted. Raises ``Problem`` 410 if the report is lost."""
-    digest = view.details.get("report_sha256")
-    if digest is None:
-        return None
-    return json_of(state.store, digest)
-
-
 def _rivals(state: State, caller: Caller, view: PsfView) -> list[PsfView]:
     """The other certified PSFs of the same series. This PSF can supersede them, or one of them can be its successor."""
     wanted = PsfFilter(
@@ -359,6 +342,7 @@ def psf_parameters(psf: PsfView) -> dict[str, str]:
     fitted = (psf.details.get("fit") or {}).get("parameters") or {}
     fit = {name: f"{found['value']:.5g} ± {found['sigma']:.2g}" for name, found in fitted.items()}
     told = {name: value for name, value in made.items() if name not in NOT_PARAMETERS}
+    instrument = parse_toml(made.get("instrument_toml") or "")
     return {
         "Name": psf.name,
         "Version": psf.version,
@@ -366,11 +350,5 @@ def psf_parameters(psf: PsfView) -> dict[str, str]:
         **facts,
         **{f"fit: {name}": said for name, said in fit.items()},
         **flat(told),
-        **{f"instrument file: {name}": said for name, said in flat(_instrument(made)).items()},
+        **{f"instrument file: {name}": said for name, said in flat(instrument).items()},
     }
-
-
-def _instrument(made: Mapping[str, Any]) -> dict[str, Any]:
-    """The content of the instrument file from which a PSF was built; empty if there is none."""
-    text = made.get("instrument_toml")
-    return parse_toml(text) if isinstance(text, str) else {}

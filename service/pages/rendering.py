@@ -130,7 +130,6 @@ def _environment() -> Environment:
         "number": number,
         "percent": percent,
         "counted": counted,
-        "page_of": page_of,
         "sentence": plain,
     }
     return made
@@ -222,11 +221,6 @@ def differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[tuple[st
     first, second = flat(one), flat(other)
     rows = [(name, first.get(name, "-"), second.get(name, "-")) for name in {**first, **second}]
     return [row for row in rows if row[1] != row[2]]
-
-
-def page_of(address: str) -> str:
-    """The address of the page for an address of the API: ``/products/ID`` for ``/v1/products/ID``."""
-    return address.removeprefix("/v1")
 
 
 # --- the page of an error ---------------------------------------------------------------------------------

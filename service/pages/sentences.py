@@ -17,6 +17,7 @@ _FIELDS = {
     "image_id": "Image",
     "glob": "Files",
     "folder": "Output folder",
+    "lasts_days": "Lifetime",
     "layout": "Names of the files",
 }
 _FIELD = re.compile(r"(?:^|(?<=; ))(?:[a-z0-9_-]+\.)*([a-z_]+): ")
