@@ -58,8 +58,8 @@ router = APIRouter(prefix="/psfs", include_in_schema=False)
 def psf_list(request: Request, caller: PageReading, state: Shared, cursor: Cursor = None) -> Response:
     """PSFs, newest first, with the filters of the API."""
     asked = _asked(request)
-    wanted: PsfFilter = checked(psf_filter, {name: asked[name] for name in FILTERS if name in asked})
-    found = list_psfs(Listing(request, PER_PAGE, cursor), caller, state, wanted, asked.get("context"))
+    filters: PsfFilter = checked(psf_filter, {name: asked[name] for name in FILTERS if name in asked})
+    found = list_psfs(Listing(request, PER_PAGE, cursor), caller, state, filters, asked.get("context"))
     return page(
         request,
         "psfs.html",

@@ -19,6 +19,8 @@ _FIELDS = {
     "folder": "Output folder",
     "lasts_days": "Lifetime",
     "layout": "Names of the files",
+    "photon_gain_dn": "Photon gain (DN)",
+    "read_noise_dn": "Read noise (DN)",
 }
 _FIELD = re.compile(r"(?:^|(?<=; ))(?:[a-z0-9_-]+\.)*([a-z_]+): ")
 _NO_FIELDS: Mapping[str, Any] = {}

@@ -250,6 +250,8 @@ def test_the_api_reference_loads_nothing_from_other_hosts(shared_service: Keyed)
         answer = api.get(urljoin("/docs", address))
         assert answer.status_code == 200 and len(answer.content) > 100, address
         assert "default-src 'none'" in answer.headers["Content-Security-Policy"]
-    assert "SwaggerUIBundle" in api.get("/docs/swagger-ui-bundle.js").text
-    for address in ("/docs/..%2Fmain.py", "/docs/..%2F__init__.py", "/static/1/..%2Frendering.py"):
+    assert any(
+        "SwaggerUIBundle" in api.get(address).text for address in loaded if address.endswith("bundle.js")
+    )
+    for address in ("/docs/..%2Fmain.py", "/static/1/..%2Frendering.py", "/static/..%2Frendering.py/1"):
         refusal(api.get(address), 404, "http-404")

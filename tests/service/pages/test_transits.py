@@ -86,7 +86,7 @@ def test_a_form_starts_a_job_with_its_options(api: TestClient, transit_id: str) 
 def test_wrong_options_and_kinds_are_told_on_a_page(api: TestClient, transit_id: str) -> None:
     for kind, form, told, status in (
         ("psf-fit", {"seed": "soon"}, "Seed: ", 422),
-        ("psf-fit", {"photon_gain_dn": "six"}, "as numbers in DN; got six", 422),
+        ("psf-fit", {"photon_gain_dn": "six"}, "Photon gain (DN): ", 422),
         ("deconvolve", {}, "Expected one of psf-fit", 404),
     ):
         answer = api.post(f"/transits/{transit_id}/jobs/{kind}", data=form, headers=PERSON)
