@@ -53,27 +53,13 @@ def render(template: str | Template, **values: Any) -> Page:
     Raises DataError "not-a-png" for a figure that is no PNG, and "uneven-table" for a row of another length than the
     header of its table.
     """
-    sections: list[list[str]] = []
+    sections: list[list[str]] = []  # the templates add a title and a content for each section
     figures: list[bytes] = []
-
-    def begin_section(title: str) -> int:
-        sections.append([title])
-        return len(sections)
-
-    def add_figure(png: bytes) -> int:
-        figures.append(png)
-        return len(figures)
 
     html = (
         environment()
         .get_template(template)
-        .render(
-            values,
-            sections=sections,
-            begin_section=begin_section,
-            add_figure=add_figure,
-            next_table=count(1).__next__,
-        )
+        .render(values, sections=sections, figures=figures, next_table=count(1).__next__)
     )
     texts = {name: values.get(name, "") for name in ("title", "lead", "footer")}
     texts["sections"] = [content for _, content in sections]
