@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any, get_args
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, TypeVar, get_args
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
@@ -51,6 +51,7 @@ FILTERS = ("instrument", "channel", "kind", "name", "version", "status", "valid_
 # Entries of the provenance that say when and where a PSF was made, not how.
 NOT_PARAMETERS = ("psf_id", "job_id", "file", "history", "instrument_toml")
 Tables = Mapping[str, Any]
+Thing = TypeVar("Thing")
 router = APIRouter(prefix="/psfs", include_in_schema=False)
 
 
@@ -109,7 +110,7 @@ def _asked(request: Request) -> dict[str, str]:
 def psf(psf_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
     """The PSF. Without tables it has no curves; a form then starts the job that makes them."""
     view = get_psf(psf_id, caller, state)
-    tables, told = _tables(state, caller, psf_id)
+    tables, told = _unless("no-tables", tables_of, state, caller, psf_id)
     report_sha256 = view.details.get("report_sha256")
     others = state.catalogue.psfs.page(PsfFilter(), caller.owner, limit=MOST_OTHERS + 1)
     status = get_psf_status(psf_id, caller, state)
@@ -231,29 +232,21 @@ def validity(psf: PsfView) -> str:
     return f"from {psf.valid_from or 'the beginning'} to {psf.valid_to or 'now and later'}"
 
 
-def _tables(state: State, caller: Caller, psf_id: str) -> tuple[Tables | None, str | None]:
-    """Two results: the tables, and None; or None, and the reason why the PSF has no tables."""
+def _unless(code: str, get: Callable[..., Thing], *args: Any) -> tuple[Thing | None, str | None]:
+    """What ``get`` returns, and None; or None, and the reason if it raises a problem with this code."""
     try:
-        return tables_of(state, caller, psf_id), None
+        return get(*args), None
     except Problem as problem:
-        if problem.code != "no-tables":
+        if problem.code != code:
             raise
         return None, problem.detail
 
 
 def _series(state: State, caller: Caller, name: str | None) -> SeriesView | None:
     """The series of total PSFs with this name; None if there is no such series, or if none of its PSFs was certified."""
-    if name is None:
+    if name is None or not name.endswith(f"/{TOTAL}"):
         return None
-    instrument, channel, kind = name.split("/")
-    if kind != TOTAL:
-        return None
-    try:
-        return get_series(instrument, channel, kind, caller, state)
-    except Problem as problem:
-        if problem.code != "no-such-series":
-            raise
-        return None
+    return _unless("no-such-series", get_series, *name.split("/"), caller, state)[0]
 
 
 def _rivals(state: State, caller: Caller, view: PsfView) -> list[PsfView]:
@@ -293,7 +286,9 @@ def comparison(
     """The two PSFs. Without tables, or with different pixel scales, only their parameters are compared."""
     one, other = get_psf(psf_id, caller, state), get_psf(other_id, caller, state)
     labels = _labels(one, other)
-    (first, why), (second, other_why) = (_tables(state, caller, identity) for identity in (psf_id, other_id))
+    (first, why), (second, other_why) = (
+        _unless("no-tables", tables_of, state, caller, identity) for identity in (psf_id, other_id)
+    )
     compared, told = None, why or other_why
     if first is not None and second is not None:
         try:
