@@ -103,6 +103,7 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
     )
     problems.install(app, problem_page)
     login.install(app)
+    assets.install(app)
     _correct_description(app)
     guard.install(app, access, settings, problem_page)
     app.state.requests = observation.install(app)
@@ -133,7 +134,6 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
         links.router,
         links.cutouts,
         operation.router,
-        assets.router,
         image_pages.router,
         job_pages.router,
         image_pages.products,

@@ -13,6 +13,7 @@ import base64
 import re
 import struct
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from itertools import count
 from pathlib import Path
@@ -30,31 +31,43 @@ CSS_DPI = 96  # CSS pixels per inch: a figure is shown at the size (in inches) a
 
 _NUMBER = re.compile(r"[-+\N{MINUS SIGN}]?[\d.]+(e[-+]?\d+)?( ?%)?( (±|to) [-+]?[\d.]+(e[-+]?\d+)?)?")
 _SPACES = re.compile(r"[ \n]+")
+_FIGURE = re.compile(r'(?<=src=")figure:(\d+)')
 
 
-def render(template: str | Template, **values: Any) -> str:
+@dataclass(frozen=True)
+class Page:
+    """A page. html: the whole page in one file.
+
+    For other pages that show the same: texts: the title, the lead and the footer as text, and the sections as HTML, in which
+    ``figure:N`` is the address of the figure N. figures: PNG, in reading order, from N = 1.
+    """
+
+    html: str
+    texts: dict[str, Any]
+    figures: list[bytes]
+
+
+def render(template: str | Template, **values: Any) -> Page:
     """The page that a template draws from these values. Figures, tables and sections are numbered in reading order.
 
     Raises DataError "not-a-png" for a figure that is no PNG, and "uneven-table" for a row of another length than the
     header of its table.
     """
-    sections: list[str] = []
+    sections: list[list[str]] = []  # the templates add a title and a content for each section
+    figures: list[bytes] = []
 
-    def begin_section(title: str) -> int:
-        sections.append(title)
-        return len(sections)
-
-    return (
+    html = (
         environment()
         .get_template(template)
-        .render(
-            values,
-            sections=sections,
-            begin_section=begin_section,
-            next_figure=count(1).__next__,
-            next_table=count(1).__next__,
-        )
+        .render(values, sections=sections, figures=figures, next_table=count(1).__next__)
     )
+    texts = {name: values.get(name, "") for name in ("title", "lead", "footer")}
+    texts["sections"] = [content for _, content in sections]
+
+    def inside(found: re.Match[str]) -> str:
+        return f"data:image/png;base64,{base64.b64encode(figures[int(found[1]) - 1]).decode('ascii')}"
+
+    return Page(_FIGURE.sub(inside, html), texts, figures)
 
 
 def named_texts(values: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str]]:
@@ -82,13 +95,12 @@ def _is_number(cell: str) -> bool:
     return cell in ("", DASH) or _NUMBER.fullmatch(cell) is not None
 
 
-def source_and_size(png: bytes) -> Markup:
-    """The attributes src, width and height of a figure (PNG). Raises DataError "not-a-png"."""
+def size_of(png: bytes) -> Markup:
+    """The attributes width and height of a figure (PNG). Raises DataError "not-a-png"."""
     if png[:8] != PNG_START or len(png) < 24:
         raise DataError("not-a-png", f"expected a figure as PNG; got data that begin with {png[:8]!r}")
     width, height = (round(side * CSS_DPI / PLOT_DPI) for side in struct.unpack(">II", png[16:24]))
-    data = base64.b64encode(png).decode("ascii")
-    return Markup('src="data:image/png;base64,{}" width="{}" height="{}"').format(data, width, height)
+    return Markup('width="{}" height="{}"').format(width, height)
 
 
 def prose(text: str) -> Markup:
@@ -108,6 +120,6 @@ def environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    made.filters |= {"prose": prose, "source_and_size": source_and_size, "with_error": with_error}
+    made.filters |= {"prose": prose, "size_of": size_of, "with_error": with_error}
     made.globals |= {"named_texts": named_texts, "numeric_columns": numeric_columns, "DASH": DASH}
     return made

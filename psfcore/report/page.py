@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from psfcore.drawing.numbers import DASH, with_error
-from psfcore.drawing.page import render
+from psfcore.drawing.page import Page, render
 from psfcore.evaluation.evaluation import (
     CENTRE_PX,
     INVERSION_STEPS,
@@ -50,7 +50,7 @@ _CONSTANTS = {
 }
 
 
-def report_page(report: PsfReport, provenance: dict[str, Any]) -> str:
+def report_page(report: PsfReport, provenance: dict[str, Any]) -> Page:
     """The page of a report. provenance: names and values, possibly nested, that describe software and request."""
     of = report.transit.instrument or "an unnamed instrument"
     inputs = inputs_of(report)

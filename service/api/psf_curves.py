@@ -172,15 +172,12 @@ async def get_cutout(
 ) -> Response:
     """The central part of the PSF, not renormalised. Its centre is at [size // 2, size // 2]."""
     row = await run_in_threadpool(state.row, PsfRow, psf_id, caller.owner)
-    headers = files.headers_of(f"{ANSWERS_VERSION} {row.file_sha256} cutout {size}")
-    if (same := files.not_modified(request, headers)) is not None:
-        return same
 
     def write(path: Path, target: BinaryIO) -> None:
         write_cutout(path, size, state.settings.psf_limits, target)
 
-    filename = f"psf-{psf_id[:12]}-{size}px.fits"
-    return await cutout_of(state, caller.owner, row, write, filename=filename, headers=headers)
+    part, filename = f"{ANSWERS_VERSION} cutout {size}", f"psf-{psf_id[:12]}-{size}px.fits"
+    return await cutout_of(request, state, row, part, write, filename=filename)
 
 
 def tables_of(state: State, caller: Caller, psf_id: str) -> Mapping[str, Any]:

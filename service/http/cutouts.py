@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
+from fastapi import Request, Response
 from fastapi.responses import StreamingResponse
 
 from service.http import files
@@ -19,18 +20,22 @@ PIECE_BYTES = 2**20
 
 
 async def cutout_of(
+    request: Request,
     state: State,
-    owner: str,
     row: ProductRow | PsfRow,
+    part: str,
     write: Callable[[Path, BinaryIO], None],
     *,
     filename: str,
-    headers: dict[str, str],
-) -> StreamingResponse:
-    """The answer with the part of a stored file that ``write(path, target)`` writes, in the owner's turn.
+) -> Response:
+    """The part of a stored file that ``write(path, target)`` writes, in the turn of the row's owner; or 304 if the client already
+    has it. part: a text that tells the part from the other parts of the file, and from those of other versions.
 
     Raises the errors of ``write`` as a Problem.
     """
+    headers = files.headers_of(f"{row.file_sha256} {part}")
+    if (same := files.not_modified(request, headers)) is not None:
+        return same
 
     def written() -> BinaryIO:
         check_disk(state)
@@ -45,7 +50,7 @@ async def cutout_of(
         return file
 
     with as_problems():
-        file = await state.pixels.run(owner, written)
+        file = await state.pixels.run(row.owner, written)
     headers["Content-Disposition"] = f'attachment; filename="{filename}"'
     headers["Content-Length"] = str(file.seek(0, io.SEEK_END))
     return StreamingResponse(_pieces(file), media_type=files.FITS_TYPE, headers=headers)

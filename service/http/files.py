@@ -66,8 +66,8 @@ def send(
         raise Problem(404, *missing)
     content = base64.b64encode(bytes.fromhex(digest)).decode()
     headers = {"ETag": f'"{digest}"', "Cache-Control": KEPT, "Repr-Digest": f"sha-256=:{content}:"}
-    if _client_has(request, headers["ETag"]):
-        return Response(status_code=304, headers=headers)
+    if (same := not_modified(request, headers)) is not None:
+        return same
     find = partial(path_of, store, digest, size)
     return _Stored(request, find, media_type=media_type, filename=filename, headers=headers)
 
@@ -92,7 +92,9 @@ def headers_of(content: str) -> dict[str, str]:
 
 def not_modified(request: Request, headers: dict[str, str]) -> Response | None:
     """The answer 304 if the client already has the content with these headers; otherwise None."""
-    return Response(status_code=304, headers=headers) if _client_has(request, headers["ETag"]) else None
+    tags = [tag.strip().removeprefix("W/") for tag in request.headers.get("if-none-match", "").split(",")]
+    has = "*" in tags or headers["ETag"] in tags
+    return Response(status_code=304, headers=headers) if has else None
 
 
 def json_of(store: Store, digest: str, size: int | None = None) -> dict[str, Any]:
@@ -122,12 +124,6 @@ def path_of(store: Store, digest: str, size: int | None = None) -> Path:
 def _logged(error: BadFile) -> Problem:
     log.error("%s", error.message)
     return problem(error)
-
-
-def _client_has(request: Request, etag: str) -> bool:
-    """Whether the client already has the content of this ETag (If-None-Match)."""
-    tags = [tag.strip().removeprefix("W/") for tag in request.headers.get("if-none-match", "").split(",")]
-    return "*" in tags or etag in tags
 
 
 # --- uploads --------------------------------------------------------------------------------------------

@@ -179,7 +179,7 @@ class _Guard:
         if hosts is None:
             return
         sent = headers.get("host", "")
-        if _host_name(sent) not in hosts:
+        if _host_of(f"//{sent}")[1] not in hosts:
             raise Problem(
                 421,
                 "host-not-served",
@@ -206,12 +206,14 @@ def _check_form(path: str, headers: Headers) -> None:
         raise Problem(415, "bad-form", f"expected {URL_ENCODED}; got {FORM}: send fields only")
 
 
-def _host_of(origin: str) -> str | None:
-    """The host and port of an origin; None for a text that is no address."""
+def _host_of(address: str) -> tuple[str | None, str]:
+    """The host of an address with its port, and without it and the brackets of IPv6, in lower case; None and "" for a
+    text that is no address."""
     try:
-        return urlsplit(origin).netloc.lower()
+        parts = urlsplit(address)
+        return parts.netloc.lower(), parts.hostname or ""
     except ValueError:
-        return None
+        return None, ""
 
 
 def _check_origin(method: str, headers: Headers) -> None:
@@ -222,7 +224,7 @@ def _check_origin(method: str, headers: Headers) -> None:
     if site is not None:
         foreign = site not in ("same-origin", "none")
     else:  # an older browser, or a program
-        foreign = origin is not None and _host_of(origin) != headers.get("host", "").lower()
+        foreign = origin is not None and _host_of(origin)[0] != headers.get("host", "").lower()
     if foreign:
         raise Problem(
             403,
@@ -270,14 +272,6 @@ def _keep_own_cookie(scope: Scope, headers: Headers) -> None:
     own = re.search(rf"(?:^|;) *({cookie_name(scope['scheme'])}=[\w-]+) *(?:;|$)", ";".join(sent), re.ASCII)
     if own is not None:
         scope["headers"].append((b"cookie", own[1].encode()))
-
-
-def _host_name(sent: str) -> str:
-    """The host in a Host header: lower case, without its port and the brackets of IPv6."""
-    try:
-        return urlsplit(f"//{sent}").hostname or ""
-    except ValueError:
-        return ""
 
 
 def _keep(headers: MutableHeaders, scope: Scope) -> None:

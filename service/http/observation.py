@@ -98,7 +98,9 @@ class _Observed:
             seconds = time.perf_counter() - started
             route = getattr(scope.get("route"), "path", NOWHERE)
             method = scope["method"] if scope["method"] in METHODS else "other"
-            caller = _caller(scope)
+            # The caller, if known: the owner, and the id of the key, or the address. The key itself is never logged.
+            found = scope.get("state", {}).get("caller")
+            caller = {} if found is None else {"owner": found.owner, "caller": found.name}
             self._metrics.count(route, method, status, seconds, received)
             # The request in its span, in the words of the semantic conventions of OpenTelemetry.
             attributes: dict[str, traces.Attribute] = {
@@ -114,9 +116,3 @@ class _Observed:
             fields = {"route": route, "status": status, "seconds": round(seconds, 4), **caller}
             # The path does not contain the query.
             log.log(level, "%s %s %d", method, scope["path"], status, extra={"fields": fields})
-
-
-def _caller(scope: Scope) -> dict[str, str]:
-    """The caller, if known: the owner, and the id of the key, or the address. The key itself is never logged."""
-    caller = scope.get("state", {}).get("caller")
-    return {} if caller is None else {"owner": caller.owner, "caller": caller.name}

@@ -11,7 +11,6 @@ from fastapi.responses import JSONResponse, RedirectResponse
 
 from service.api.bulk import (
     LOOK_FROM,
-    BulkEstimate,
     BulkId,
     Failed,
     Result,
@@ -104,39 +103,22 @@ def start(response: Response, caller: PageBulk, state: Shared, form: SentForm) -
 
 
 @router.post("/check")
-def check_folder_run(request: Request, caller: PageBulk, state: Shared, form: SentForm) -> Response:
-    """Show what the run of files in a folder would do, and the form again. Nothing is started."""
-    try:
-        estimate = estimate_bulk(_folder_run(form), caller, state)
-    except Problem as problem:
-        return _check_page(request, form, caller, state, problem=problem)
-    return _check_page(request, form, caller, state, estimate=estimate)
-
-
 @router.post("/files")
-def start_folder_run(
+def folder_run(
     request: Request, response: Response, caller: PageBulk, state: Shared, form: SentForm
 ) -> Response:
-    """Start the run of files in a folder, and show it. If the form is refused, it is shown again with the reason."""
+    """Start the run of files in a folder, and show it; or only show what it would do, and the form again. If the form is
+    refused, it is shown again with the reason."""
+    estimate, problem = None, None
     try:
-        run = submit_bulk(_folder_run(form), response, caller, state)
-    except Problem as problem:
-        return _check_page(request, form, caller, state, problem=problem)
-    return RedirectResponse(f"/bulk/{run.id}", 303)
-
-
-def _check_page(
-    request: Request,
-    form: Sent,
-    caller: Caller,
-    state: State,
-    *,
-    estimate: BulkEstimate | None = None,
-    problem: Problem | None = None,
-) -> Response:
-    """The page of a checked run. Raises a problem that the person cannot solve in the form."""
-    if problem is not None and problem.status not in OF_FIELDS:
-        raise problem
+        run = _folder_run(form)
+        if request.url.path.endswith("/files"):
+            return RedirectResponse(f"/bulk/{submit_bulk(run, response, caller, state).id}", 303)
+        estimate = estimate_bulk(run, caller, state)
+    except Problem as error:
+        if error.status not in OF_FIELDS:
+            raise
+        problem = error
     refused = [] if estimate is None else estimate.refused[:MOST_REFUSED]
     return page(
         request,

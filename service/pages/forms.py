@@ -66,15 +66,7 @@ def parameters(model: type[BaseModel], form: Sent) -> dict[str, Any]:
 
 def _noise(form: Sent) -> dict[str, Any]:
     """The noise figures of a form; no parameter if both fields are empty. The request itself accepts only numbers."""
-    given = filled(form, "photon_gain_dn", "read_noise_dn")
-    try:
-        figures = {name: float(value) for name, value in given.items()}
-    except ValueError as error:
-        raise Problem(
-            422,
-            "invalid-request",
-            f"expected photon gain and read noise as numbers in DN; got {', '.join(given.values())}: correct the two fields",
-        ) from error
+    figures = checked(dict[str, float], filled(form, "photon_gain_dn", "read_noise_dn"))
     return {"noise": figures} if figures else {}
 
 
@@ -91,11 +83,19 @@ def number_field(kind: str, name: str) -> Markup:
 
 
 def checked(model: Any, values: Mapping[str, Any], *, above: int = 0) -> Any:
-    """The model with these values. Raises ``Problem`` 422, which names each wrong field. above: as for ``wrong_fields``."""
+    """The model with these values; or what a function returns for them.
+
+    above: how many names to remove from the start of each field's path (``loc``), because they are levels of the model and
+    not fields of the form. Raises ``Problem`` 422, which names each wrong field.
+    """
     try:
         return _adapter(model).validate_python(dict(values))
     except ValidationError as error:
-        raise wrong_fields(error, model, above=above) from error
+        lines = [
+            f"{'.'.join(map(str, one['loc'][above:])) or 'the form'}: {explanation}"
+            for one, explanation in explained(error.errors(), model)
+        ]
+        raise Problem(422, "invalid-request", "; ".join(lines)) from error
 
 
 def job_request(kind: str, values: Mapping[str, Any]) -> JobRequest:
@@ -110,19 +110,6 @@ def start_job(kind: str, values: Mapping[str, Any], caller: Caller, state: State
     request = job_request(kind, values)
     job = submit_job(request, Response(), caller, state)
     return RedirectResponse(f"/jobs/{job.id}", 303)
-
-
-def wrong_fields(error: ValidationError, model: Any, *, above: int = 0) -> Problem:
-    """The problem that names each wrong field.
-
-    model: the model that refused the fields. above: how many names to remove from the start of each field's path
-    (``loc``), because they are levels of the model and not fields of the form.
-    """
-    lines = [
-        f"{'.'.join(map(str, one['loc'][above:])) or 'the form'}: {explanation}"
-        for one, explanation in explained(error.errors(), model)
-    ]
-    return Problem(422, "invalid-request", "; ".join(lines))
 
 
 # --- the options of a deconvolution -----------------------------------------------------------------------

@@ -6,7 +6,6 @@ from __future__ import annotations
 import hashlib
 import shutil
 import tempfile
-from dataclasses import dataclass
 from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from psfcore.deconvolve.summary import steps_done
 from psfcore.fits.header import read_summary
 from psfcore.instruments.files import telescope_of, telescopes
 from service.api.bulk import LOOK_FROM
-from service.api.images import ImageView, delete_product, get_product_lineage, rerun_product, upload_image
+from service.api.images import delete_product, get_product_lineage, rerun_product, upload_image
 from service.api.jobs import EstimateView, estimate_job, submit_job
 from service.api.pixels import picture_of, prepare_image
 from service.http.callers import Caller
@@ -41,7 +40,7 @@ from service.pages.forms import (
 )
 from service.pages.jobs import job_lines
 from service.pages.login import PageReading, PageSubmitting
-from service.pages.rendering import counted, duration, number, page, short
+from service.pages.rendering import counted, duration, page
 from service.pages.sentences import draft, of_problem
 from service.views import JobView, ProductView
 from workers.catalogue.psfs import PsfFilter
@@ -60,6 +59,12 @@ MOST_RERUNS = 10
 OF_OPTIONS = (404, 409, 413, 422)
 TO_ALLOW = ("channel-mismatch", "already-deconvolved", "psf-as-image")
 SURE = "If you are sure, allow it below."
+# Swagger UI loads its icons from data: addresses in its style sheet, and its scripts set styles.
+REFERENCE_HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:; "
+    "connect-src 'self'; frame-ancestors 'none'; base-uri 'none'",
+    "Referrer-Policy": "no-referrer",
+}
 START, OPEN, CHECK = "Start", "Open the product", "Check and start"
 router = APIRouter(include_in_schema=False)
 products = APIRouter(prefix="/products/{product_id}", include_in_schema=False)
@@ -69,18 +74,24 @@ products = APIRouter(prefix="/products/{product_id}", include_in_schema=False)
 def home(request: Request, caller: PageReading, state: Shared) -> Response:
     """The first page: drop an image; the latest products, images and jobs."""
     catalogue, owner = state.catalogue, caller.owner
-    images = catalogue.page(ImageRow, owner=owner, limit=LATEST)
+    products = catalogue.page(ProductRow, owner=owner, limit=LATEST)
     return page(
         request,
         "home.html",
         telescopes=telescopes(),
         most_bytes=state.settings.max_upload_bytes,
-        products=[product_card(state, row) for row in catalogue.page(ProductRow, owner=owner, limit=LATEST)],
-        images=[image_line(row) for row in images],
+        products=[(row, catalogue.get(ImageRow, row.image_id, owner)) for row in products],
+        images=catalogue.page(ImageRow, owner=owner, limit=LATEST),
         jobs=job_lines(
             [JobView.of(row) for row in catalogue.page(JobRow, owner=owner, limit=LATEST)], caller, state
         ),
     )
+
+
+@router.get("/docs")
+def docs(request: Request) -> Response:
+    """The interactive reference of the API, which is open to everybody."""
+    return page(request, "docs.html", headers=REFERENCE_HEADERS)
 
 
 @router.post("/images")
@@ -97,31 +108,6 @@ async def take_sample(caller: PageSubmitting, state: Shared) -> Response:
     return RedirectResponse(f"/images/{row.id}", 303)
 
 
-def product_card(state: State, row: ProductRow) -> dict[str, object]:
-    """The entry of a product in a list."""
-    view = ProductView.of(row)
-    image = state.catalogue.get(ImageRow, row.image_id, row.owner)
-    thumbnail = row.details.get("thumbnail_sha256")
-    return {
-        "id": view.id,
-        "name": (image and image.filename) or short(view.id),
-        "created_at": view.created_at,
-        "thumbnail": f"/v1/products/{view.id}/thumbnail" if thumbnail else None,
-    }
-
-
-def image_line(row: ImageRow) -> dict[str, object]:
-    """The entry of an image in a list."""
-    header = row.summary
-    telescope = [str(header[name]) for name in ("telescop", "detector") if header.get(name)]
-    if header.get("wavelnth"):
-        telescope.append(f"{header['wavelnth']:g} Å")
-    return ImageView.of(row).model_dump() | {
-        "telescope": " ".join(telescope) or "unknown",
-        "observed": header.get("date_obs") or "unknown",
-    }
-
-
 def _add_sample(state: State, caller: Caller) -> ImageRow:
     take = Allowed(state, caller)
     with as_file(files(__package__).joinpath(SAMPLE)) as shipped, tempfile.TemporaryDirectory() as folder:
@@ -136,21 +122,6 @@ def _add_sample(state: State, caller: Caller) -> ImageRow:
 
 
 # --- an image ---------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Checked:
-    """The result of a check of the options. lines: sentences, the most important first. button: the button's text."""
-
-    good: bool
-    lines: tuple[str, ...]
-    button: str
-    problem: Problem | None = None
-
-    @property
-    def code(self) -> str:
-        """The code of the problem; empty if there is none."""
-        return "" if self.problem is None else self.problem.code
 
 
 @router.get("/images/{image_id}/picture")
@@ -172,12 +143,11 @@ def image(image_id: Identity, request: Request, caller: PageReading, state: Shar
         request,
         "image.html",
         image=row,
-        facts=_facts(row),
         checked=checked,
         psfs=psfs,
         others=others,
-        unknown=checked.code == "no-psf-for-instrument",
-        products=[product_line(ProductView.of(product)) for product in products],
+        unknown=checked["code"] == "no-psf-for-instrument",
+        products=products,
         methods=usual_steps(),
         asked=shown_options(asked),
     )
@@ -187,10 +157,7 @@ def image(image_id: Identity, request: Request, caller: PageReading, state: Shar
 def check(image_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
     """The check of the options in the query, for the script of the page."""
     state.row(ImageRow, image_id, caller.owner)
-    found = _checked(image_id, request.query_params, caller, state)
-    return JSONResponse(
-        {"good": found.good, "lines": found.lines, "button": found.button, "code": found.code}
-    )
+    return JSONResponse(_checked(image_id, request.query_params, caller, state))
 
 
 @in_turn(router.post("/images/{image_id}/start"))
@@ -210,16 +177,6 @@ def start(
     return RedirectResponse(f"/jobs/{job.id}", 303)
 
 
-def product_line(product: ProductView) -> dict[str, Any]:
-    """The entry of a product in the list of the products of an image."""
-    done = product.details["steps_done"]
-    return {
-        "id": product.id,
-        "told": f"{product.details['method']['name']}, {counted(done, 'step')}, PSF {product.psf_version}",
-        "created_at": product.created_at,
-    }
-
-
 def _psfs(chosen: str, image: ImageRow, caller: Caller, state: State) -> tuple[list[PsfRow], list[PsfRow]]:
     """The PSFs that the form offers, the newest and the chosen one: those that suit the image, and the others."""
     found = list(state.catalogue.psfs.page(PsfFilter(), caller.owner, limit=MOST_PSFS))
@@ -230,15 +187,19 @@ def _psfs(chosen: str, image: ImageRow, caller: Caller, state: State) -> tuple[l
     return fit, [psf for psf in found if psf not in fit]
 
 
-def _checked(image_id: str, asked: Sent, caller: Caller, state: State) -> Checked:
+def _checked(image_id: str, asked: Sent, caller: Caller, state: State) -> dict[str, Any]:
+    """The check of the options. good: whether the job can start. lines: sentences, the most important first. button: its
+    text. code: of the problem; empty if there is none."""
     try:
         found = estimate_job(deconvolution(image_id, asked), caller, state)
     except Problem as problem:
         if problem.status not in OF_OPTIONS:
             raise
         advice = (SURE,) if problem.code in TO_ALLOW else ()
-        return Checked(False, (of_problem(problem), *advice), CHECK, problem)
-    return Checked(True, tuple(_lines(found)), OPEN if found.existing else START)
+        lines = [of_problem(problem), *advice]
+        return {"good": False, "lines": lines, "button": CHECK, "code": problem.code}
+    button = OPEN if found.existing else START
+    return {"good": True, "lines": _lines(found), "button": button, "code": ""}
 
 
 def _lines(found: EstimateView) -> list[str]:
@@ -262,23 +223,6 @@ def _lines(found: EstimateView) -> list[str]:
 def _psf(psf: ChosenPsf) -> str:
     status = "" if psf.status is None else f" ({psf.status})"
     return f"PSF {psf.name}{f' {psf.version}' if psf.version else ''}{status}"
-
-
-def _facts(row: ImageRow) -> list[tuple[str, str]]:
-    """The properties of the image that its header states: name and value."""
-    header, line = row.summary, image_line(row)
-    ny, nx = header["shape"]
-    scale = header.get("cdelt1")
-    facts = {
-        "Telescope": str(line["telescope"]),
-        "Observed": str(line["observed"]),
-        "Size": f"{nx} x {ny} px",
-        "Pixel scale": f"{abs(scale):.4g} arcsec" if scale else "not in the header",
-        "Exposure": f"{header['exposure_s']:g} s" if header.get("exposure_s") else "not in the header",
-        "Unit": header.get("unit") or "not in the header (BUNIT)",
-        "Id": row.id,
-    }
-    return list(facts.items())
 
 
 # --- a product ------------------------------------------------------------------------------------------
@@ -311,11 +255,9 @@ def product(product_id: Identity, request: Request, caller: PageReading, state: 
         ],
         deprecated=deprecated,
         redo=_again(row, psf_id="" if better is None else better.id),
-        changed=_changed(row.details),
-        look_at=row.details["changes"]["artefacts"]["score"] >= LOOK_FROM,
         look_from=LOOK_FROM,
         again=_again(row),
-        made=_made(row.details),
+        steps=steps_done(row.details),
         lineage=get_product_lineage(product_id, caller, state),
         reruns=[one for one in reruns if one.kind == "rerun"],
     )
@@ -358,38 +300,3 @@ def _again(row: ProductRow, *, psf_id: str | None = None) -> str:
     """The page of the image, with the options of the product. psf_id: another PSF; empty: the one that the service chooses."""
     other = {} if psf_id is None else {"psf_id": psf_id, "picked_for": None, "psf_recipe": None}
     return address_of({**row.details["parameters"], **other})
-
-
-def _changed(details: dict[str, Any]) -> list[tuple[str, str]]:
-    """What the deconvolution changed in the image, as far as it was measured."""
-    shown = {
-        "Total flux": _measured(details["flux_change_pct"], "{:+.3g} %"),
-        "Brightest 1 % of the pixels": _measured(details["bright_change_pct"], "{:+.3g} %"),
-        "Darkest 1 % of the pixels": _measured(details["dark_change_pct"], "{:+.3g} %"),
-        "Noise, compared with the input": _measured(details["noise_amplification"], "{:.3g} times"),
-        "Chi-squared per pixel": number(details["chi2_per_pixel"]),
-        "Negative pixels": f"{details['negative_pixels']:,}".replace(",", " "),
-        "Saturated pixels": f"{details['masked_pixels']['saturated']:,}".replace(",", " "),
-        "Score of artefacts": number(details["changes"]["artefacts"]["score"]),
-    }
-    return [(name, text) for name, text in shown.items() if text != "-"]
-
-
-def _made(details: dict[str, Any]) -> list[tuple[str, str]]:
-    """How the product was made."""
-    method = details["method"]
-    own = [
-        f"{name} {value}"
-        for name, value in method.items()
-        if value is not None and name not in ("name", "algorithm_version", "steps")
-    ]
-    return [
-        ("Method", f"{method['name']}, {steps_done(details)}"),
-        *([("Options", ", ".join(own))] if own else []),
-        ("Edges", f"{details['edges']}, a band of {details['edge_band_px']} px depends on them"),
-        ("Software", details["software_version"]),
-    ]
-
-
-def _measured(value: float | None, form: str) -> str:
-    return "-" if value is None else form.format(value)

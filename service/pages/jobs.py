@@ -32,6 +32,9 @@ TITLES = {
     "psf-interpolate": "Interpolation in time",
     "psf-tables": "Tables of a PSF",
     "rerun": "Rerun",
+    # Kinds of reports whose jobs have other names.
+    "cross-validation": "Cross-validation",
+    "gap": "Gap diagnosis",
 }
 router = APIRouter(prefix="/jobs", include_in_schema=False)
 

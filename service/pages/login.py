@@ -21,7 +21,6 @@ from fastapi import APIRouter, FastAPI, Form, Query, Request, Response, Security
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import RedirectResponse
 from fastapi.security import SecurityScopes
-from pydantic import ValidationError
 
 from service.api.keys import KeyId, MadeKey, NewKey, list_keys, make_key, revoke_key
 from service.http.callers import BEARER, Caller, address_of, admit, names_its_site, session_token
@@ -31,9 +30,10 @@ from service.http.paging import Cursor, Listing
 from service.http.problems import Problem
 from service.http.rates import Bucket
 from service.http.state import Shared, State
+from service.pages.forms import checked
 from service.pages.rendering import page
 from service.pages.sentences import of_error
-from workers.catalogue.access import LABEL_LENGTH, MEANINGS, OWNER_RULE, KeyRefused, Scope
+from workers.catalogue.access import LABEL_LENGTH, MEANINGS, KeyRefused, Scope
 
 DAY_S = 86_400
 LONGEST_ADDRESS = 2000  # characters
@@ -237,17 +237,14 @@ def make(
     owner: Annotated[str, Form()] = "",
 ) -> Response:
     """Make a key, and show it."""
-    try:
-        body = NewKey.model_validate(
-            {
-                "scopes": scopes or [],
-                "label": label[:LABEL_LENGTH],
-                "lasts_days": lasts_days or None,
-                "owner": owner or None,
-            }
+    if not scopes:
+        raise Problem(
+            422,
+            "invalid-request",
+            "expected at least one scope of the list: go back and choose what the key allows",
         )
-    except ValidationError as error:
-        raise _wrong_form(error) from error
+    asked = {"scopes": scopes, "label": label[:LABEL_LENGTH]}
+    body = checked(NewKey, asked | {"lasts_days": lasts_days or None, "owner": owner or None})
     made = make_key(body, response, caller, state)
     return _keys_page(request, caller, state, made.owner, made=made)
 
@@ -291,15 +288,3 @@ def _keys_page(
         lifetimes=LIFETIMES_DAYS,
         label_length=LABEL_LENGTH,
     )
-
-
-def _wrong_form(error: ValidationError) -> Problem:
-    """The problem that says which fields of the form are wrong, and what to do."""
-    wrong = {str(found["loc"][0]) for found in error.errors() if found["loc"]}
-    advice = {
-        "scopes": "expected at least one scope of the list: go back and choose what the key allows",
-        "lasts_days": "expected a lifetime of the list: go back and choose one",
-        "owner": f"expected an owner of {OWNER_RULE}: go back and correct the name",
-    }
-    said = [text for name, text in advice.items() if name in wrong] or [str(error)]
-    return Problem(422, "invalid-request", "; ".join(said))

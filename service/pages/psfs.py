@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from typing import Annotated, Any, get_args
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, TypeVar, get_args
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import RedirectResponse
-from pydantic import ValidationError, validate_call
 from starlette.datastructures import FormData
 
 from psfcore.errors import DataError
@@ -33,19 +32,9 @@ from service.http.gate import in_turn
 from service.http.paging import Cursor, Listing
 from service.http.problems import Problem
 from service.http.state import Shared, State
-from service.pages.forms import SentForm, checked, filled, parameters, start_job, text, wrong_fields
+from service.pages.forms import SentForm, checked, filled, parameters, start_job, text
 from service.pages.login import PageCertifying, PageReading, PageSubmitting
-from service.pages.plots import (
-    Plot,
-    Series,
-    fit_parameters,
-    fit_plots,
-    light_beyond_plot,
-    radial_plot,
-    shown_radii,
-    with_errors,
-)
-from service.pages.rendering import number, page, short
+from service.pages.rendering import dense, differing, flat, number, page, short
 from service.views import PsfView
 from workers.catalogue.access import Scope
 from workers.catalogue.psfs import PsfFilter
@@ -62,15 +51,16 @@ FILTERS = ("instrument", "channel", "kind", "name", "version", "status", "valid_
 # Entries of the provenance that say when and where a PSF was made, not how.
 NOT_PARAMETERS = ("psf_id", "job_id", "file", "history", "instrument_toml")
 Tables = Mapping[str, Any]
+Thing = TypeVar("Thing")
 router = APIRouter(prefix="/psfs", include_in_schema=False)
-_filter: Callable[..., PsfFilter] = validate_call(psf_filter)
 
 
 @router.get("")
 def psf_list(request: Request, caller: PageReading, state: Shared, cursor: Cursor = None) -> Response:
     """PSFs, newest first, with the filters of the API."""
     asked = _asked(request)
-    found = list_psfs(Listing(request, PER_PAGE, cursor), caller, state, _wanted(asked), asked.get("context"))
+    filters: PsfFilter = checked(psf_filter, {name: asked[name] for name in FILTERS if name in asked})
+    found = list_psfs(Listing(request, PER_PAGE, cursor), caller, state, filters, asked.get("context"))
     return page(
         request,
         "psfs.html",
@@ -113,14 +103,6 @@ def _asked(request: Request) -> dict[str, str]:
     return {name: text for name in names if (text := request.query_params.get(name, "").strip())}
 
 
-def _wanted(asked: dict[str, str]) -> PsfFilter:
-    """The filter of the catalogue. Raises ``Problem`` 422 for a wrong value."""
-    try:
-        return _filter(**{name: asked[name] for name in FILTERS if name in asked})
-    except ValidationError as error:
-        raise wrong_fields(error, PsfFilter) from error
-
-
 # --- a PSF ------------------------------------------------------------------------------------------------
 
 
@@ -128,8 +110,8 @@ def _wanted(asked: dict[str, str]) -> PsfFilter:
 def psf(psf_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
     """The PSF. Without tables it has no curves; a form then starts the job that makes them."""
     view = get_psf(psf_id, caller, state)
-    tables, told = _tables(state, caller, psf_id)
-    fit = _fit(state, view)
+    tables, told = _unless("no-tables", tables_of, state, caller, psf_id)
+    report_sha256 = view.details.get("report_sha256")
     others = state.catalogue.psfs.page(PsfFilter(), caller.owner, limit=MOST_OTHERS + 1)
     status = get_psf_status(psf_id, caller, state)
     return page(
@@ -139,12 +121,10 @@ def psf(psf_id: Identity, request: Request, caller: PageReading, state: Shared) 
         facts=psf_facts(view),
         status_view=status,
         series=_series(state, caller, status.series),
-        plots=[] if tables is None else _plots(tables),
-        resolution=None if tables is None else lookup.curve(tables)["resolution"],
+        profile=None if tables is None else lookup.profile(tables),
+        curve=None if tables is None else lookup.curve(tables),
         no_tables=told,
-        fit=fit,
-        fit_values=[] if fit is None else fit_parameters(fit),
-        fit_plots=[] if fit is None else fit_plots(fit),
+        fit=None if report_sha256 is None else json_of(state.store, report_sha256),
         lineage=get_psf_lineage(psf_id, caller, state),
         others=[one for one in others if one.id != psf_id][:MOST_OTHERS],
         rivals=_rivals(state, caller, view),
@@ -252,57 +232,21 @@ def validity(psf: PsfView) -> str:
     return f"from {psf.valid_from or 'the beginning'} to {psf.valid_to or 'now and later'}"
 
 
-def profile_series(label: str, profile: Mapping[str, Any], name: str, places: list[int]) -> Series:
-    """The mean weight of one component at each radius. If the PSF was fitted, the errors are included."""
-    return with_errors(label, profile["mean_weight"][name], profile["sigma"].get(name), places)
-
-
-def _tables(state: State, caller: Caller, psf_id: str) -> tuple[Tables | None, str | None]:
-    """Two results: the tables, and None; or None, and the reason why the PSF has no tables."""
+def _unless(code: str, get: Callable[..., Thing], *args: Any) -> tuple[Thing | None, str | None]:
+    """What ``get`` returns, and None; or None, and the reason if it raises a problem with this code."""
     try:
-        return tables_of(state, caller, psf_id), None
+        return get(*args), None
     except Problem as problem:
-        if problem.code != "no-tables":
+        if problem.code != code:
             raise
         return None, problem.detail
 
 
-def _plots(tables: Tables) -> list[Plot]:
-    curve, profile = lookup.curve(tables), lookup.profile(tables)
-    sigma = curve["sigma_points"]
-    beyond = {name: (pct, sigma.get(name)) for name, pct in curve["light_beyond_pct"].items()}
-    radii, names = profile["radius_px"], profile["mean_weight"]
-    places = shown_radii(radii)
-    rings = radial_plot(
-        "Mean weight by radius",
-        "mean weight of a pixel",
-        [radii[at] for at in places],
-        [profile_series(name, profile, name, places) for name in names],
-    )
-    return [rings, light_beyond_plot(curve["radii_px"], beyond)]
-
-
 def _series(state: State, caller: Caller, name: str | None) -> SeriesView | None:
     """The series of total PSFs with this name; None if there is no such series, or if none of its PSFs was certified."""
-    if name is None:
+    if name is None or not name.endswith(f"/{TOTAL}"):
         return None
-    instrument, channel, kind = name.split("/")
-    if kind != TOTAL:
-        return None
-    try:
-        return get_series(instrument, channel, kind, caller, state)
-    except Problem as problem:
-        if problem.code != "no-such-series":
-            raise
-        return None
-
-
-def _fit(state: State, view: PsfView) -> dict[str, Any] | None:
-    """The report on the fit; None if the PSF was not fitted. Raises ``Problem`` 410 if the report is lost."""
-    digest = view.details.get("report_sha256")
-    if digest is None:
-        return None
-    return json_of(state.store, digest)
+    return _unless("no-such-series", get_series, *name.split("/"), caller, state)[0]
 
 
 def _rivals(state: State, caller: Caller, view: PsfView) -> list[PsfView]:
@@ -342,12 +286,13 @@ def comparison(
     """The two PSFs. Without tables, or with different pixel scales, only their parameters are compared."""
     one, other = get_psf(psf_id, caller, state), get_psf(other_id, caller, state)
     labels = _labels(one, other)
-    (first, why), (second, other_why) = (_tables(state, caller, identity) for identity in (psf_id, other_id))
-    plots, figures, told = [], None, why or other_why
+    (first, why), (second, other_why) = (
+        _unless("no-tables", tables_of, state, caller, identity) for identity in (psf_id, other_id)
+    )
+    compared, told = None, why or other_why
     if first is not None and second is not None:
         try:
-            figures = lookup.compare(first, second)
-            plots = _compared_plots(labels, first, second)
+            compared = _compared(first, second)
         except DataError as error:
             told = error.message
     return page(
@@ -356,19 +301,25 @@ def comparison(
         one=one,
         other=other,
         labels=labels,
-        plots=plots,
-        figures=figures,
         told=told,
-        differences=differences(one, other),
+        differences=differing(psf_parameters(one), psf_parameters(other)),
+        compared=compared,
     )
 
 
-def differences(one: PsfView, other: PsfView) -> list[tuple[str, str, str]]:
-    """The facts and parameters that differ: name, and the value of each PSF ("-": it has none)."""
-    first, second = _parameters(one), _parameters(other)
-    names = [*first, *(name for name in second if name not in first)]
-    rows = [(name, first.get(name, "-"), second.get(name, "-")) for name in names]
-    return [row for row in rows if row[1] != row[2]]
+def _compared(one: Tables, other: Tables) -> dict[str, Any]:
+    """The curves of two PSFs at the radii that both have, and their differences. Raises DataError "plate-scale-mismatch"."""
+    figures, both = lookup.compare(one, other), (one, other)
+    profiles = [lookup.profile(tables) for tables in both]
+    means = [profile["mean_weight"][lookup.TOTAL] for profile in profiles]
+    shown = [figures["radii_px"][at] for at in dense(figures["radii_px"])]
+    return {
+        "figures": figures,
+        "profiles": profiles,
+        "radii": min((profile["radius_px"] for profile in profiles), key=len),
+        "ratios": [b / a if a > 0 else None for a, b in zip(*means, strict=False)],
+        "curves": [lookup.curve(tables, shown) for tables in both],
+    }
 
 
 def _labels(one: PsfView, other: PsfView) -> tuple[str, str]:
@@ -379,77 +330,20 @@ def _labels(one: PsfView, other: PsfView) -> tuple[str, str]:
     return first, second
 
 
-def _parameters(psf: PsfView) -> dict[str, str]:
+def psf_parameters(psf: PsfView) -> dict[str, str]:
+    """The facts and parameters by which PSFs are compared: name and value."""
     facts = {name: said for name, said in psf_facts(psf) if name != "Id"}
     made = dict(psf.details.get("provenance") or {})
     fitted = (psf.details.get("fit") or {}).get("parameters") or {}
     fit = {name: f"{found['value']:.5g} ± {found['sigma']:.2g}" for name, found in fitted.items()}
     told = {name: value for name, value in made.items() if name not in NOT_PARAMETERS}
+    instrument = parse_toml(made.get("instrument_toml") or "")
     return {
         "Name": psf.name,
         "Version": psf.version,
         "Status": str(psf.status),
         **facts,
         **{f"fit: {name}": said for name, said in fit.items()},
-        **dict(_flat(told)),
-        **{f"instrument file: {name}": said for name, said in _flat(_instrument(made))},
+        **flat(told),
+        **{f"instrument file: {name}": said for name, said in flat(instrument).items()},
     }
-
-
-def _instrument(made: Mapping[str, Any]) -> dict[str, Any]:
-    """The content of the instrument file from which a PSF was built; empty if there is none."""
-    text = made.get("instrument_toml")
-    return parse_toml(text) if isinstance(text, str) else {}
-
-
-def _flat(values: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str]]:
-    """Nested values as pairs of name and text. The name contains all levels, separated by dots."""
-    for key, value in values.items():
-        name = f"{before}{key}"
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{name}.")
-        elif isinstance(value, list) and value and all(isinstance(item, Mapping) for item in value):
-            for place, item in enumerate(value, start=1):
-                yield from _flat(item, f"{name} {item.get('name', place)}.")
-        elif value is not None:
-            yield name, str(value)
-
-
-def _compared_plots(labels: tuple[str, str], one: Tables, other: Tables) -> list[Plot]:
-    profiles = [lookup.profile(tables) for tables in (one, other)]
-    rings = min(len(profile["radius_px"]) for profile in profiles)
-    places = shown_radii(profiles[0]["radius_px"][:rings])
-    radii = [profiles[0]["radius_px"][at] for at in places]
-    curves = [
-        profile_series(label, profile, lookup.TOTAL, places)
-        for label, profile in zip(labels, profiles, strict=True)
-    ]
-    means = [profile["mean_weight"][lookup.TOTAL] for profile in profiles]
-    ratios = [means[1][at] / means[0][at] if means[0][at] > 0 else None for at in places]
-    title = f"Ratio of the mean weights: {labels[1]} / {labels[0]}"
-    return [
-        radial_plot("Mean weight by radius", "mean weight of a pixel", radii, curves),
-        radial_plot(title, "ratio", radii, [Series("ratio", ratios)], y_log=False),
-        *_light_plots(labels, one, other),
-    ]
-
-
-def _light_plots(labels: tuple[str, str], one: Tables, other: Tables) -> list[Plot]:
-    """The light beyond each radius that both tables have, and the difference."""
-    compared = lookup.compare(one, other)
-    places = shown_radii(compared["radii_px"])
-    radii = [compared["radii_px"][at] for at in places]
-    found = [lookup.curve(tables, radii) for tables in (one, other)]
-    curves = {
-        label: (curve["light_beyond_pct"][lookup.TOTAL], curve["sigma_points"].get(lookup.TOTAL))
-        for label, curve in zip(labels, found, strict=True)
-    }
-    points, sigma = compared["difference_points"][lookup.TOTAL], compared["sigma_points"].get(lookup.TOTAL)
-    difference = radial_plot(
-        f"Difference of the light beyond a radius: {labels[1]} minus {labels[0]}",
-        "percentage points",
-        radii,
-        [with_errors("difference", points, sigma, places)],
-        y_log=False,
-    )
-    return [light_beyond_plot(radii, curves), difference]

@@ -9,7 +9,7 @@ A file in ``templates`` has the templates of one subject, one after the other. A
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from functools import cache
 from importlib.resources import files
@@ -33,6 +33,8 @@ POLICY = (
 )
 SHORT = 12  # letters of an id that a page shows
 PLAIN_BELOW = 1e6  # larger numbers are shown with a power of ten
+FINE_TO_PX = 10.0  # up to this radius a table shows every radius
+RATIO = 1.05  # farther out: the least ratio of two successive radii
 TITLES = {
     403: "This key does not allow that",
     404: "There is nothing here",
@@ -121,12 +123,13 @@ def _environment() -> Environment:
     made.filters |= {
         "short": short,
         "date": date,
+        "dense": dense,
+        "differing": differing,
         "size": size,
         "duration": duration,
         "number": number,
         "percent": percent,
         "counted": counted,
-        "page_of": page_of,
         "sentence": plain,
     }
     return made
@@ -187,9 +190,37 @@ def percent(value: float | None) -> str:
     return "-" if value is None else f"{value:+.3g}\N{NO-BREAK SPACE}%"
 
 
-def page_of(address: str) -> str:
-    """The address of the page for an address of the API: ``/products/ID`` for ``/v1/products/ID``."""
-    return address.removeprefix("/v1")
+def dense(radii: Sequence[float]) -> list[int]:
+    """The places of the radii that a table shows: all near the centre; farther out, radii in ratios of at least ``RATIO``."""
+    chosen: list[int] = []
+    for place, radius in enumerate(radii):
+        last = place in (0, len(radii) - 1)
+        if last or radius <= FINE_TO_PX or radius >= radii[chosen[-1]] * RATIO:
+            chosen.append(place)
+    return chosen
+
+
+def flat(values: Mapping[str, Any]) -> dict[str, str]:
+    """Nested values as texts. A name contains all levels, separated by dots."""
+    texts: dict[str, str] = {}
+    for key, value in values.items():
+        if isinstance(value, list) and value and all(isinstance(item, Mapping) for item in value):
+            levels = {f"{key} {item.get('name', place)}": item for place, item in enumerate(value, start=1)}
+        else:
+            levels = {key: value}
+        for name, one in levels.items():
+            if isinstance(one, Mapping):
+                texts |= {f"{name}.{inner}": text for inner, text in flat(one).items()}
+            elif one is not None:
+                texts[name] = str(one)
+    return texts
+
+
+def differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """The values that differ, which may be nested: the name, and the value of each ("-": it has none)."""
+    first, second = flat(one), flat(other)
+    rows = [(name, first.get(name, "-"), second.get(name, "-")) for name in {**first, **second}]
+    return [row for row in rows if row[1] != row[2]]
 
 
 # --- the page of an error ---------------------------------------------------------------------------------

@@ -17,7 +17,10 @@ _FIELDS = {
     "image_id": "Image",
     "glob": "Files",
     "folder": "Output folder",
+    "lasts_days": "Lifetime",
     "layout": "Names of the files",
+    "photon_gain_dn": "Photon gain (DN)",
+    "read_noise_dn": "Read noise (DN)",
 }
 _FIELD = re.compile(r"(?:^|(?<=; ))(?:[a-z0-9_-]+\.)*([a-z_]+): ")
 _NO_FIELDS: Mapping[str, Any] = {}

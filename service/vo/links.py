@@ -233,17 +233,14 @@ async def get_region(request: Request, caller: Reading, state: Shared, fields: F
             "no-such-product",
             f"expected ID, the id of one of your products; got {names[0][:120]!a}: list your products",
         )
-    headers = files.headers_of(f"{ANSWERS_VERSION} {row.file_sha256} {shape} {numbers} {frame}")
-    if (same := files.not_modified(request, headers)) is not None:
-        return same
 
     def write(path: Path, target: BinaryIO) -> None:
         from psfcore.fits.viewing.regions import write_cutout  # loads the numerical libraries
 
         write_cutout(path, _region(shape, numbers, frame), state.limits, target)
 
-    filename = f"product-{row.id[:12]}-cutout.fits"
-    return await cutout_of(state, caller.owner, row, write, filename=filename, headers=headers)
+    part, filename = f"{ANSWERS_VERSION} {shape} {numbers} {frame}", f"product-{row.id[:12]}-cutout.fits"
+    return await cutout_of(request, state, row, part, write, filename=filename)
 
 
 def described_cutout(identity: str, base: str) -> Service:

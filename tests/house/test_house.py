@@ -93,7 +93,6 @@ UNPACKING = {
     "psfcore/transit/archive.py": "writes .tar",
     "psfcore/drawing/thumbnail.py": "writes PNG",
     "psfcore/scatter/solution_file.py": "names the errors of numpy.load for files that it wrote",
-    "service/pages/assets.py": "writes gzip of its own pages",
 }
 # Where astropy opens a whole file, with its tables and tiles.
 OPENING = {

@@ -37,6 +37,7 @@ NAMED_IN_DETAILS = (
     "changes_picture_sha256",
     "output_sha256",
     "page_sha256",
+    "page_texts_sha256",
     "report_sha256",
     "tables_sha256",
     "thumbnail_sha256",
@@ -51,6 +52,8 @@ def files_of(row: ProductRow | PsfRow | ReportRow) -> Iterator[tuple[str, int | 
     for name in NAMED_IN_DETAILS:
         if row.details.get(name) is not None:
             yield row.details[name], None
+    for digest in row.details.get("figures_sha256", ()):
+        yield digest, None
 
 
 def intact(store: Store, row: ProductRow | PsfRow | ReportRow) -> bool:

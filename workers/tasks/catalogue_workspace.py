@@ -43,6 +43,7 @@ ENTRIES = {
     "tables": "tables_sha256",
     "report": "report_sha256",
     "html": "page_sha256",
+    "texts": "page_texts_sha256",
     "changes": "changes_picture_sha256",
     "thumbnail": "thumbnail_sha256",
 }
@@ -234,15 +235,18 @@ class CatalogueWorkspace(Workspace):
             file_sha256, size_bytes = self.write(write)
         if draw is not None:
             preview = (self.write(draw) if drawn is None else drawn.result())[0]
-        digests = {name: self.write(write)[0] for name, write in files.items()}
+        entries: dict[str, Any] = {ENTRIES[name]: self.write(write)[0] for name, write in files.items()}
+        figures = [self.write(partial(Path.write_bytes, data=png))[0] for png in result.figures()]
+        if figures:
+            entries["figures_sha256"] = figures
         row: ResultRow = TABLES[result.type](
             owner=self.owner,
             id=result.id,
             created_at=time.time(),
             file_sha256=file_sha256,
             bytes=size_bytes,
-            preview_sha256=digests.get("thumbnail") if draw is None else preview,
-            details={**result.details, **{ENTRIES[name]: digest for name, digest in digests.items()}},
+            preview_sha256=entries.get(ENTRIES["thumbnail"]) if draw is None else preview,
+            details={**result.details, **entries},
             **result.columns,
         )
         return row

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from psfcore.errors import module_of_extra
 from psfcore.fits.psfs import write_psf
@@ -16,6 +16,9 @@ from workers.contract.requests import Parameters
 from workers.settings import library_versions, software_version
 from workers.tasks.workspace import Result
 from workers.versions import TOTAL, PsfStatus, channel_of, series_of
+
+if TYPE_CHECKING:
+    from psfcore.drawing.page import Page
 
 Write = Callable[[Path], object]
 
@@ -86,7 +89,7 @@ def report_result(
     details: Mapping[str, Any],
     *,
     draw: Write | None = None,
-    page: Callable[[], str] | None = None,
+    page: Callable[[], Page] | None = None,
     transit_id: str | None = None,
     about_id: str | None = None,
 ) -> Result:
@@ -95,10 +98,13 @@ def report_result(
     files: dict[str, Write] = {"file": partial(write_json, content=content)}
     if draw is not None:
         files["preview"] = draw
-    if page is not None:
-        files["html"] = lambda path: path.write_text(page(), "utf-8")
     columns = {"kind": kind, "transit_id": transit_id, "about_id": about_id}
-    return Result(ResultType.REPORT, identity, details, files, columns)
+    if page is None:
+        return Result(ResultType.REPORT, identity, details, files, columns)
+    drawn = cache(page)
+    files["html"] = lambda path: path.write_text(drawn().html, "utf-8")
+    files["texts"] = lambda path: path.write_text(json.dumps(drawn().texts), "utf-8")
+    return Result(ResultType.REPORT, identity, details, files, columns, lambda: drawn().figures)
 
 
 def provenance_of(job_id: str, request: Parameters) -> dict[str, Any]:

@@ -42,9 +42,9 @@ class TurnOver(Exception):
 class Result:
     """A result of a task, whose files are not yet written.
 
-    details: the entries that describe it. files: functions that write its files, by name, in the order in which they
-    are written: "file" is the result itself, "preview" its picture (PNG), "html" its page. columns: the further columns of its row
-    in a catalogue.
+    details: the entries that describe it. files: functions that write its files, by name: "file" is the result itself, "preview"
+    its picture (PNG), "html" its page. columns: the further columns of its row in a catalogue. figures: draws the figures of the
+    page (PNG).
     """
 
     type: ResultType
@@ -52,6 +52,7 @@ class Result:
     details: Mapping[str, Any]
     files: Mapping[str, Callable[[Path], object]]
     columns: Mapping[str, Any] = field(default_factory=dict)
+    figures: Callable[[], Sequence[bytes]] = lambda: ()
 
 
 class Workspace(ABC):

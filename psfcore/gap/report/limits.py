@@ -74,7 +74,7 @@ def plan_page(found: Planned) -> str:
         footer="",
         found=found,
         tables=sys.modules[__name__],
-    )
+    ).html
 
 
 def sentence(found: Planned) -> str:

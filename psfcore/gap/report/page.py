@@ -11,7 +11,7 @@ import sys
 from typing import Any
 
 from psfcore.drawing.numbers import DASH, with_error
-from psfcore.drawing.page import render
+from psfcore.drawing.page import Page, render
 from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.evidence.linear_model import FLOOR
 from psfcore.gap.evidence.tree import FAMILIES
@@ -41,7 +41,7 @@ VERDICTS = {
 MOST_HYPOTHESES = 8
 
 
-def gap_page(found: Diagnosis, report: Report) -> str:
+def gap_page(found: Diagnosis, report: Report) -> Page:
     """The page of a diagnosis. report: its report (schema gap/3).
 
     The optional entry "provenance" of the report states the software, the libraries, the seed and the PSF at which the fit

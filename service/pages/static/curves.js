@@ -29,15 +29,19 @@ function tableOf(figure) {
   const table = figure.querySelector("details table");
   const heads = [...table.querySelectorAll("thead th")];
   const rows = [...table.tBodies[0].rows].map((row) => [...row.cells].map((cell) => cell.textContent));
-  const numbers = (place) => rows.map((row) => (row[place] === "" ? null : Number(row[place])));
+  const number = (text) => (Number.isFinite(Number(text)) ? Number(text) : null); // "-" is no number
+  const numbers = (place) => rows.map((row) => number(row[place]));
   const columns = heads.map((head, place) => ({ role: head.dataset.role, label: head.dataset.label ?? head.textContent, place }));
   const x = columns.find((column) => column.role === "x");
   const series = columns
     .filter((column) => ["line", "points"].includes(column.role))
     .map((column) => {
-      const end = (role) => columns.find((other) => other.role === role && other.label === column.label);
-      const ends = end("low") && end("high") ? [numbers(end("low").place), numbers(end("high").place)] : null;
-      return { label: column.label, draw: column.role, values: numbers(column.place), ends };
+      const [values, sigma, low, high] = [column.role, "sigma", "low", "high"].map((role) => {
+        const found = columns.find((other) => other.role === role && other.label === column.label);
+        return found && numbers(found.place);
+      });
+      const away = (sign) => values.map((value, row) => (value === null || sigma[row] === null ? null : value + sign * sigma[row]));
+      return { label: column.label, draw: column.role, values, ends: sigma ? [away(-1), away(1)] : low && high ? [low, high] : null };
     });
   return { x: numbers(x.place), xLabel: x.label, series };
 }

@@ -10,11 +10,12 @@ from matplotlib.figure import Figure as Drawing
 
 from psfcore.drawing.page import (
     PLOT_DPI,
+    Page,
     environment,
     named_texts,
     numeric_columns,
     render,
-    source_and_size,
+    size_of,
     with_error,
 )
 from psfcore.errors import DataError
@@ -53,7 +54,7 @@ How to read
 """
 
 
-def page(name: str = "000.fits") -> str:
+def page(name: str = "000.fits") -> Page:
     return render(
         environment().from_string(PARTS),
         title=f"Title {name}",
@@ -67,7 +68,7 @@ def page(name: str = "000.fits") -> str:
 
 def test_a_page_stands_alone_and_escapes_any_file_name() -> None:
     for name in ("000.fits", MALICIOUS, "' onload='alert(3)", "{{ 7 * 7 }}", "&amp;é日"):
-        html = page(name)
+        html = page(name).html
         check_stands_alone(html)
         tags = read_page(html)
         assert next(t for t in tags if t.name == "h1").text == f"Title {name}"
@@ -76,7 +77,7 @@ def test_a_page_stands_alone_and_escapes_any_file_name() -> None:
 
 
 def test_figures_and_tables_are_numbered_and_values_named_and_rounded() -> None:
-    html = page()
+    html = page().html
     tags = read_page(html)
     starts = [t.text.split(".")[0][:8].strip() for t in tags if t.name == "figcaption"]
     assert starts == ["Figure 1", "Table 1", "Figure 2"]
@@ -89,13 +90,27 @@ def test_figures_and_tables_are_numbered_and_values_named_and_rounded() -> None:
         "How to read 000.fits." in html and next(t for t in tags if t.name == "dt").text == "000.fits000.fits"
     )
     assert "12.3\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}0.4\N{NO-BREAK SPACE}%" in html
-    assert 'width="288" height="192"' in source_and_size(png(3.0)), "the size in which it was drawn"
+    assert 'width="288" height="192"' in size_of(png(3.0)), "the size in which it was drawn"
     with pytest.raises(DataError, match="not-a-png"):
-        source_and_size(b"GIF89a")
+        size_of(b"GIF89a")
     with pytest.raises(DataError, match=r"uneven-table: expected 2 .*; got 3"):
         numeric_columns(["a", "b"], [["1", "2", "3"]])
     values = {"seed": 5, "libraries": {"num_py": "9.9"}, "started_from_psf": None}
     assert list(named_texts(values)) == [("seed", "5"), ("libraries: num py", "9.9")]
+
+
+def test_the_texts_of_a_page_name_its_figures() -> None:
+    made = page(MALICIOUS)
+    first, folded = made.texts.pop("sections")
+    assert made.texts == {
+        "title": f"Title {MALICIOUS}",
+        "lead": f"Lead {MALICIOUS}: 12.3 ± 0.4 %",
+        "footer": MALICIOUS,
+    }
+    assert "<script>" not in first and first.count('src="figure:1"') == 1 and 'src="figure:2"' in folded
+    assert made.figures == [png(), png(2.0)]
+    for section in (first, folded):
+        assert "".join(section.split('src="figure:')[0]) in made.html
 
 
 def test_a_value_is_rounded_to_the_second_digit_of_its_error() -> None:

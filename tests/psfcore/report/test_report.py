@@ -137,7 +137,7 @@ def test_too_few_images_for_folds_are_evaluated_with_their_own_fit_and_the_page_
     said = {missing.what: missing.why for missing in report.missing}
     assert "at least 6 images" in said["a test on held-out images"]
     assert said["the effect of wrong dark levels"] == "it was not requested"
-    html = report_page(report, PROVENANCE)
+    html = report_page(report, PROVENANCE).html
     check_stands_alone(html)
     assert "this is not an independent test" in html
 
@@ -167,7 +167,7 @@ def test_the_curve_on_the_page_is_that_of_the_psf() -> None:
 
 
 def test_the_page_shows_every_part_and_every_image() -> None:
-    html = report_page(whole(), PROVENANCE)
+    html = report_page(whole(), PROVENANCE).html
     check_stands_alone(html)
     tags = read_page(html)
     text = next(t for t in tags if t.name == "body").text
@@ -188,7 +188,7 @@ def test_the_report_page_a_given_psf_lists_what_it_does_not_show_and_why() -> No
     residuals = np.array([f.residual_pct / f.noise_pct for f in report.evaluation.frames])
     assert abs(residuals.mean()) < 4 / np.sqrt(residuals.size)
     with blank_figures():
-        html = report_page(report, PROVENANCE)
+        html = report_page(report, PROVENANCE).html
     check_stands_alone(html)
     text = next(t for t in read_page(html) if t.name == "body").text
     assert "Not shown: other shapes of scatter" in text
@@ -207,6 +207,6 @@ def test_a_malicious_file_name_is_text() -> None:
     with blank_figures():
         html = report_page(
             dataclasses.replace(report, transit=transit, evaluation=evaluation), {"file": name}
-        )
+        ).html
     check_stands_alone(html)
     assert [t.text for t in read_page(html) if t.name == "td"].count(name) == 4

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,16 +22,23 @@ from workers.tasks.results import report_result
 GAP_ID = "9a" * 32
 
 
-def keep_gap_report(settings: Settings, owner: str = DEFAULT_OWNER) -> dict[str, Any]:
-    """Add the report GAP_ID of an owner to the catalogue, as the job gap-diagnose does; returns its JSON."""
+def keep_gap_report(settings: Settings, owner: str = DEFAULT_OWNER, *, old: bool = False) -> dict[str, Any]:
+    """Add the report GAP_ID of an owner to the catalogue, as the job gap-diagnose does; returns its JSON.
+
+    old: as a version did that kept the page in one file alone.
+    """
     found = small_gaps.found()
     said = gap_report(found)
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(plot, "PLOT_DPI", 40)  # quicker to draw
-        html = gap_page(found, said)
+        drawn = gap_page(found, said)
     catalogue, store = Catalogue(settings.catalogue_url), Store(settings.data_dir)
     workspace = CatalogueWorkspace(catalogue, store, settings, owner, "j", lambda *_: None)
-    workspace.add(report_result(GAP_ID, "gap", said, {"sentence": said["sentence"]}, page=lambda: html))
+    result = report_result(GAP_ID, "gap", said, {"sentence": said["sentence"]}, page=lambda: drawn)
+    if old:
+        files = {name: result.files[name] for name in ("file", "html")}
+        result = replace(result, files=files, figures=lambda: ())
+    workspace.add(result)
     catalogue.close()
     return said
 

@@ -291,8 +291,8 @@ def test_what_cannot_be_made_is_told_on_a_page(service: Keyed) -> None:
     client = browser(service, service.key("ann"))
     for data, told in (
         ({}, "at least one scope"),
-        ({"scopes": "read", "lasts_days": "soon"}, "a lifetime"),
-        ({"scopes": "read", "owner": "A B"}, "an owner"),
+        ({"scopes": "read", "lasts_days": "soon"}, "Lifetime: "),
+        ({"scopes": "read", "owner": "A B"}, "Owner: "),
         ({"scopes": "admin"}, "scopes of your own key"),
         ({"scopes": "read", "owner": "bob"}, "your own name"),
     ):

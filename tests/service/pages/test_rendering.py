@@ -1,6 +1,6 @@
 """What is true of every page: its policy, that it is not kept, that names are text, and errors as pages.
 Forms: which fields become parameters, and how wrong ones are refused.
-Plots: their tables hold the numbers from which a script draws the curves; and readings of stored reports."""
+Which radii a table of a curve shows, and what differs between two things."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ from psfcore.instruments.files import instrument_names
 from service.app import create_app
 from service.http.problems import Problem
 from service.pages.forms import job_request, number_field, parameters
-from service.pages.plots import (
-    ABOVE,
-    BELOW,
+from service.pages.rendering import (
     FINE_TO_PX,
-    MAP_PX,
+    POLICY,
     RATIO,
-    Plot,
-    gap_map,
-    rerun_makers,
-    shown_radii,
-    with_errors,
+    counted,
+    date,
+    dense,
+    differing,
+    duration,
+    number,
+    percent,
+    size,
 )
-from service.pages.rendering import POLICY, counted, date, duration, number, percent, size
 from tests.conftest import write_image, write_psf
 from tests.service.conftest import upload
+from tests.service.pages.test_login import PERSON
 from workers.contract.requests import CrossValidate, GapDiagnose, Report
 from workers.settings import Settings
 
-PERSON = {"Accept": "text/html,application/xhtml+xml,*/*;q=0.8"}
 SCRIPT = "<script>alert(1)</script>"
 ESCAPED = "&lt;script&gt;alert(1)&lt;/script&gt;"
 NOTHING = "0" * 32
@@ -208,7 +208,7 @@ def test_the_fields_of_a_request_become_its_parameters() -> None:
     figures = {"photon_gain_dn": "6.5", "read_noise_dn": "2"}
     noise = {"photon_gain_dn": 6.5, "read_noise_dn": 2.0}
     assert parameters(GapDiagnose, {"correct": "1", **figures}) == {"correct": True, "noise": noise}
-    with pytest.raises(Problem, match="as numbers in DN; got many"):
+    with pytest.raises(Problem, match="photon_gain_dn: "):
         parameters(GapDiagnose, {"photon_gain_dn": "many"})
 
 
@@ -227,66 +227,20 @@ def test_a_wrong_parameter_is_named() -> None:
         job_request("deconvolve", {"image_id": "0" * 64, "method": {"name": "magic"}})
 
 
-# --- plots -----------------------------------------------------------------------------------------------
-
-
-def test_the_table_holds_x_the_values_and_the_ends_of_the_band() -> None:
-    series = [
-        with_errors("a", [9.0, 2.0, 4.0], [9.0, 0.5, 1.0], [1, 2]),
-        with_errors("b", [None, 1e-5], None),
-    ]
-    plot = Plot("t", "x", "y", [1.0, 2.0], series)
-    assert [(heading, role) for heading, _, role, _ in plot.columns] == [
-        ("a", "line"),
-        ("a, low", "low"),
-        ("a, high", "high"),
-        ("b", "line"),
-    ]
-    assert plot.rows == [(None, ["1", "2", "1.5", "2.5", ""]), (None, ["2", "4", "3", "5", "1e-05"])]
+# --- numbers of curves, and what differs ------------------------------------------------------------------
 
 
 def test_radii_are_shown_densely_near_the_centre_and_in_ratios_farther_out() -> None:
     radii = [float(radius) for radius in range(1500)]
-    shown = [radii[at] for at in shown_radii(radii)]
+    shown = [radii[at] for at in dense(radii)]
     assert shown[: int(FINE_TO_PX) + 1] == radii[: int(FINE_TO_PX) + 1] and shown[-1] == radii[-1]
     far = [radius for radius in shown[:-1] if radius > FINE_TO_PX]
     assert all(b / a >= RATIO for a, b in pairwise(far)) and len(shown) < 150
-    assert shown_radii([]) == []
+    assert dense([]) == []
 
 
-def image(number: int, residual: float | None, after: float | None = None) -> dict[str, object]:
-    return {
-        "file": f"{number:03d}.fits",
-        "fov": 1,
-        "x_px": 10.0 * number,
-        "y_px": 20.0,
-        "time_s": 100.0 - number,
-        "residual_pct": residual,
-        "noise_pct": None if residual is None else 0.5,
-        "residual_after_pct": after,
-        "noise_after_pct": None if after is None else 0.25,
-    }
-
-
-def test_discs_have_their_places_colours_and_rows() -> None:
-    found = gap_map({"shape": [100, 200], "images": [image(1, 4.0, 1.0), image(2, -4.0), image(3, None)]})
-    assert found is not None and (found.width, found.height, found.largest) == (MAP_PX, MAP_PX / 2, 4.0)
-    late, early = found.discs  # in the order of time
-    assert (late.name, late.row, late.x, late.y) == ("002.fits, pointing 1", 0, 40.0, 160.0)
-    assert early.told == "001.fits, pointing 1: +4.00 ± 0.50 %"
-    assert [disc.colour for disc in found.discs] == ["#" + bytes(BELOW).hex(), "#" + bytes(ABOVE).hex()]
-    fitted, after = found.residuals.series
-    assert (fitted.values, fitted.low, fitted.high) == ([-4.0, 4.0], [-4.5, 3.5], [-3.5, 4.5])
-    assert (after.values, after.low) == ([None, 1.0], [None, 0.75])
-    assert list(found.residuals.x) == [98.0, 99.0]
-
-
-def test_without_held_out_images_there_is_no_map() -> None:
-    for images in ([], [image(1, None)]):
-        assert gap_map({"shape": [64, 64], "images": images}) is None
-
-
-def test_only_what_differs_between_two_runs_is_listed() -> None:
-    first = {"created_at": 1.0, "name": "a", "libraries": {"numpy": "1", "scipy": "2"}}
-    again = {"created_at": 2.0, "name": "a", "libraries": {"numpy": "3", "scipy": "2"}, "id": "x"}
-    assert rerun_makers({"first": first, "again": again}) == [("library numpy", "1", "3")]
+def test_only_what_differs_is_listed() -> None:
+    first = {"name": "a", "libraries": {"numpy": "1", "scipy": "2"}, "mirrors": [{"name": "m1", "mm": 1}]}
+    again = {"name": "a", "libraries": {"numpy": "3", "scipy": "2"}, "mirrors": [{"name": "m1"}], "id": "x"}
+    changed = [("libraries.numpy", "1", "3"), ("mirrors m1.mm", "1", "-"), ("id", "-", "x")]
+    assert differing(first, again) == changed and differing(first, first) == []

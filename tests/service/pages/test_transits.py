@@ -4,9 +4,9 @@ The pages of reports: the sections and figures of a stored report, and curves an
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
@@ -86,7 +86,7 @@ def test_a_form_starts_a_job_with_its_options(api: TestClient, transit_id: str) 
 def test_wrong_options_and_kinds_are_told_on_a_page(api: TestClient, transit_id: str) -> None:
     for kind, form, told, status in (
         ("psf-fit", {"seed": "soon"}, "Seed: ", 422),
-        ("psf-fit", {"photon_gain_dn": "six"}, "as numbers in DN; got six", 422),
+        ("psf-fit", {"photon_gain_dn": "six"}, "Photon gain (DN): ", 422),
         ("deconvolve", {}, "Expected one of psf-fit", 404),
     ):
         answer = api.post(f"/transits/{transit_id}/jobs/{kind}", data=form, headers=PERSON)
@@ -107,14 +107,10 @@ def test_readers_see_no_forms_and_other_owners_nothing(settings: Settings, archi
 # --- a report -------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def gap(settings: Settings, api: TestClient) -> dict[str, Any]:
-    return keep_gap_report(settings)
-
-
 def test_a_gap_report_is_shown_with_its_sentence_map_sections_and_figures(
-    api: TestClient, gap: dict[str, Any]
+    api: TestClient, settings: Settings
 ) -> None:
+    gap = keep_gap_report(settings)
     page = api.get(f"/reports/{GAP_ID}").text
     places = [
         page.index(text)
@@ -144,6 +140,31 @@ def test_a_gap_report_is_shown_with_its_sentence_map_sections_and_figures(
         missing = api.get(f"/reports/{GAP_ID}/figures/{number}", headers=PERSON)
         assert missing.status_code == 404 and f"from 1 to {count}" in missing.text
     assert api.get(f"/reports/{'0' * 64}", headers=PERSON).status_code == 404
+    # The map and the table of residuals show the numbers of the report, in the order of time.
+    first = min(
+        (one for one in gap["images"] if one["residual_pct"] is not None), key=lambda one: one["time_s"]
+    )
+    disc = next(t.attributes for t in tags if t.name == "circle")
+    ny, nx = gap["shape"]
+    place = first["x_px"] / max(nx, ny), (ny - first["y_px"]) / max(nx, ny)
+    assert (float(disc["cx"]) / 400, float(disc["cy"]) / 400) == pytest.approx(place, abs=1e-3)
+    assert (disc["fill"] == "#b2182b") == (first["residual_pct"] > 0)
+    assert f"{first['residual_pct']:+.2f} ± {first['noise_pct']:.2f} %" in disc["data-told"]
+    table = page[page.index("Residuals of the held-out discs") :].split("<tbody>")[1].split("</tr>")[0]
+    cells = [float(cell) for cell in re.findall(r'<td class="number">([^<]*)</td>', table)]
+    shown = ("time_s", "residual_pct", "noise_pct", "residual_after_pct", "noise_after_pct")
+    assert cells == pytest.approx([first[name] for name in shown], rel=1e-4)
+
+
+def test_a_report_of_an_older_version_is_shown_with_a_link_to_its_page(
+    api: TestClient, settings: Settings
+) -> None:
+    gap = keep_gap_report(settings, old=True)
+    page = api.get(f"/reports/{GAP_ID}")
+    assert page.status_code == 200 and gap["sentence"][:40] in page.text and page.text.count("<circle") > 5
+    assert f'href="/v1/reports/{GAP_ID}/page"' in page.text and "older version" in page.text
+    assert "/figures/" not in page.text
+    assert api.get(f"/reports/{GAP_ID}/figures/1", headers=PERSON).status_code == 404
 
 
 def shown(api: TestClient, address: str, *texts: str) -> str:

@@ -41,7 +41,7 @@ def html() -> str:
     """The page of the small diagnosis, with small figures, which are quicker to draw."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(gap_plot, "PLOT_DPI", 40)
-        return gap_page(found(), report_of(found()))
+        return gap_page(found(), report_of(found())).html
 
 
 @pytest.fixture
@@ -52,7 +52,7 @@ def blank() -> Iterator[None]:
 
 
 def page_of(diagnosis: Diagnosis) -> str:
-    return gap_page(diagnosis, report_of(diagnosis))
+    return gap_page(diagnosis, report_of(diagnosis)).html
 
 
 def texts(page: str, tag: str) -> list[str]:
@@ -175,7 +175,7 @@ def test_a_malicious_file_name_is_shown_as_text(blank: None) -> None:
     report["images"][0]["file"] = name
     report["cautions"] = [name]
     report["provenance"] = {"file": name}
-    page = gap_page(found(), report)
+    page = gap_page(found(), report).html
     check_stands_alone(page)
     assert texts(page, "td").count(name) == 1
 
