@@ -221,11 +221,9 @@ class Engine:
 
     def _stage(self, kernel: Callable[..., None], plan: Plan, blocks: int, *fields: Any) -> None:
         spectrum = self._spectrum
-
-        def work(start: int, stop: int, scratch: Scratch) -> None:
-            kernel(Lines(spectrum, *scratch, plan), start, stop, *fields)
-
-        self.run(work, blocks)
+        self.run(
+            lambda start, stop, scratch: kernel(Lines(spectrum, *scratch, plan), start, stop, *fields), blocks
+        )
 
     def run(self, work: Callable[[int, int, Scratch], Any], blocks: int) -> list[Any]:
         """Call `work(start, stop, scratch)` on ranges that cover all blocks, using all threads."""
