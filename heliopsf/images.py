@@ -57,7 +57,7 @@ def deconvolve(smap: str | Path | Image, psf: AnyPsf | None = ..., **options: An
 def deconvolve(smap: Like, psf: AnyPsf | None = ..., **options: Any) -> Like: ...
 @overload
 def deconvolve(smap: Sequence[Any], psf: AnyPsf | None = ..., **options: Any) -> list[Any]: ...
-def deconvolve(  # type: ignore[misc]  # the overloads need not repeat the options
+def deconvolve(
     smap: Any,
     psf: AnyPsf | None = None,
     iterations: int | None = None,
