@@ -159,6 +159,7 @@ class Work:
             lambda image: self.run(image).pixels,
             replace(self.options, progress=told),
             estimate=result.pixels,
+            draws=self.options.error_draws,
             edge_px=result.edge_band_px,
         )
         psfs = possible_psfs()

@@ -88,7 +88,6 @@ def _step_rows(lines, start, stop, observed, x, new, changes, judgement):  # typ
     Add up (change)^2 and x^2 over all pixels, and (y - H x)^2 / variance over the judged pixels.
     """
     nx, judged = x.shape[1], judgement.rows
-    slope, ground = judgement.slope, judgement.ground
     zero, least = np.float32(0.0), np.float32(1e-30)
     for block in range(start, stop):
         z = rows_from_spectrum(lines, block)
@@ -99,7 +98,7 @@ def _step_rows(lines, start, stop, observed, x, new, changes, judgement):  # typ
                 for w in range(LANES):
                     y, model = observed[block, i, side, w], z[i, side, w]
                     misfit = y - model if y == y else zero
-                    variance = max(slope * max(model, zero) + ground, least)
+                    variance = max(judgement.slope * max(model, zero) + judgement.ground, least)
                     sum_row += judged[block, side, w] * misfit * misfit / variance
                     value = x[block, i, side, w] + misfit  # Eq. (1)
                     new[block, i, side, w] = value

@@ -127,8 +127,8 @@ def solve_linear(
     """
     x, rows = start.copy(), engine.field_shape[0]
     changes, sums = np.zeros((2, engine.row_blocks)), np.zeros(engine.row_blocks)
-    no_rows = np.zeros((engine.row_blocks, 2, LANES), np.float32)
-    nothing = Judgement(no_rows, 0, 0, 0, np.float32(0), np.float32(1), sums)
+    rows_judged = np.zeros((engine.row_blocks, 2, LANES), np.float32)
+    nothing = Judgement(rows_judged, 0, 0, 0, np.float32(0), np.float32(1), sums)
     engine.rows_forward(x)
     for left in reversed(range(steps)):
         engine.columns(adjoint=False)
@@ -177,7 +177,6 @@ def _residual_rows(lines, start, stop, observed, judgement, rows):  # type: igno
     The result is 0 beyond the number of rows.
     """
     nx, judged = observed.shape[1], judgement.rows
-    slope, ground = judgement.slope, judgement.ground
     zero, least = np.float32(0.0), np.float32(1e-30)
     for block in range(start, stop):
         z = rows_from_spectrum(lines, block)
@@ -188,7 +187,7 @@ def _residual_rows(lines, start, stop, observed, judgement, rows):  # type: igno
                 for w in range(LANES):
                     y, model = observed[block, i, side, w], z[i, side, w]
                     misfit = y - model if y == y else zero
-                    variance = max(slope * max(model, zero) + ground, least)
+                    variance = max(judgement.slope * max(model, zero) + judgement.ground, least)
                     sum_row += judged[block, side, w] * misfit * misfit / variance
                     z[i, side, w] = misfit
             if judgement.first <= i < judgement.last:

@@ -132,7 +132,6 @@ def _ratio_rows(lines, start, stop, light, floor, judgement):  # type: ignore[no
     """Replace H x, raised to `floor` where it is smaller, by Eq. (2). Add up (y - H x)^2 / variance over the judged
     pixels."""
     nx, judged = light.shape[1], judgement.rows
-    slope, ground = judgement.slope, judgement.ground
     zero, least = np.float32(0.0), np.float32(1e-30)
     for block in range(start, stop):
         z = rows_from_spectrum(lines, block)
@@ -144,7 +143,12 @@ def _ratio_rows(lines, start, stop, light, floor, judgement):  # type: ignore[no
                     y = light[block, i, side, w]
                     model = max(z[i, side, w], floor)
                     misfit = y - model
-                    part = judged[block, side, w] * misfit * misfit / max(slope * model + ground, least)
+                    part = (
+                        judged[block, side, w]
+                        * misfit
+                        * misfit
+                        / max(judgement.slope * model + judgement.ground, least)
+                    )
                     sum_row += part if y >= zero else zero
                     z[i, side, w] = y / model if y >= zero else -y
             if judgement.first <= i < judgement.last:

@@ -18,6 +18,7 @@ from psfcore.deconvolve.assess.error_planes import (
     sigma_points,
     spread_of_results,
 )
+from psfcore.deconvolve.conditions import Conditions
 from psfcore.deconvolve.work import Options, Work
 from psfcore.errors import DataError
 from psfcore.image import Image, MaskBit
@@ -62,10 +63,8 @@ def twenty_steps(psf: Psf) -> Callable[[Image], Plane]:
 
 
 def planes_of(image: Image, psf: Psf, run: Callable[[Image], Plane], **more: Any) -> ErrorPlanes:
-    of_planes = {"estimate": run(image)} | {
-        name: more.pop(name) for name in ("estimate", "seed") if name in more
-    }
-    return error_planes(image, psf, run, Options(noise=NOISE, **{"error_draws": 8} | more), **of_planes)
+    conditions = Conditions(noise=NOISE, threads=more.pop("threads", 1), progress=more.pop("progress", None))
+    return error_planes(image, psf, run, conditions, **{"estimate": run(image), "draws": 8} | more)
 
 
 def pulls(scene: Plane, psf: Psf, images: int, draws: int) -> tuple[Plane, Plane]:
@@ -77,7 +76,7 @@ def pulls(scene: Plane, psf: Psf, images: int, draws: int) -> tuple[Plane, Plane
     for seed in range(1, images + 1):
         image = see(scene, psf, seed)
         pixels = run(image)
-        planes = planes_of(image, psf, run, estimate=pixels, error_draws=draws, seed=seed)
+        planes = planes_of(image, psf, run, estimate=pixels, draws=draws, seed=seed)
         found.append(((pixels - truth) / planes.error)[inner])
     return np.array(found), truth[inner]
 
@@ -100,7 +99,7 @@ def test_pulls_have_width_one(psf: Psf, light: float, images: int) -> None:
 def test_a_delta_gives_back_the_noise_of_the_camera() -> None:
     psf = make_psf(delta(32))
     image = see(np.full((128, 128), 300.0), psf, 4)
-    planes = planes_of(image, psf, lambda seen: seen.pixels, error_draws=12)
+    planes = planes_of(image, psf, lambda seen: seen.pixels, draws=12)
     expected = np.sqrt(6.0 * 300 * EXPOSURE_S + 4.0) / EXPOSURE_S
     assert planes.amplification == pytest.approx(1.0, abs=0.03)
     assert np.median(planes.error) == pytest.approx(expected, rel=0.03)
@@ -115,10 +114,10 @@ def test_the_same_seed_gives_the_same_plane_and_masked_pixels_have_none(psf: Psf
     mask[60, 60] = MaskBit.SATURATED
     damaged = Image(pixels, mask, image.header, image.unit, image.exposure_s)
     run = twenty_steps(psf)
-    first, second = (planes_of(damaged, psf, run, error_draws=3, threads=t) for t in (1, 2))
+    first, second = (planes_of(damaged, psf, run, draws=3, threads=t) for t in (1, 2))
     np.testing.assert_array_equal(first.error, second.error)
     np.testing.assert_array_equal(np.isnan(first.error), mask != 0)
-    whole = planes_of(image, psf, run, error_draws=3)
+    whole = planes_of(image, psf, run, draws=3)
     far = np.hypot(*(np.indices(mask.shape) - np.array([50, 55])[:, None, None])) > 25
     assert np.median(first.error[far] / whole.error[far]) == pytest.approx(1.0, abs=0.01)
 
@@ -134,7 +133,7 @@ def test_the_model_is_as_bright_as_the_observation_near_the_edges(psf: Psf) -> N
 def test_progress_is_reported_and_may_stop_the_work(psf: Psf) -> None:
     image = see(cut(0.5), psf, 1)
     told: list[tuple[int, int]] = []
-    planes_of(image, psf, lambda seen: seen.pixels, error_draws=2, progress=lambda *at: told.append(at))
+    planes_of(image, psf, lambda seen: seen.pixels, draws=2, progress=lambda *at: told.append(at))
     assert told == [(1, 3), (2, 3), (3, 3)]
 
     def stop(done: int, of: int) -> None:
@@ -148,7 +147,7 @@ def test_what_has_no_error_plane_is_refused() -> None:
     psf = make_psf(delta(16))
     pixels = np.ones((32, 32))
     with pytest.raises(DataError, match="bad-draws"):
-        planes_of(make_image(pixels), psf, lambda seen: seen.pixels, error_draws=1)
+        planes_of(make_image(pixels), psf, lambda seen: seen.pixels, draws=1)
     image = Image(pixels, np.zeros((32, 32), np.uint8), make_image(pixels).header, "DN/s", None)
     with pytest.raises(DataError, match="no-exposure"):
         planes_of(image, psf, lambda seen: seen.pixels)
