@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from heliopsf.images import deconvolve as deconvolve
     from heliopsf.images import psf_for as psf_for
     from heliopsf.outputs import Deconvolution as Deconvolution
+    from heliopsf.parameters import Options as Options
     from heliopsf.psfs import Psf as Psf
     from heliopsf.psfs import build_psf as build_psf
     from heliopsf.psfs import interpolate_psf as interpolate_psf
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
 _MODULES = {
     "heliopsf.images": "deconvolve psf_for",
     "heliopsf.outputs": "Deconvolution",
+    "heliopsf.parameters": "Options",
     "heliopsf.psfs": "Psf build_psf interpolate_psf read_psf",
     "heliopsf.transits": "GapDiagnosis ScatterFit diagnose_gap fit_scatter",
     "psfcore.errors": "DataError DataWarning MissingExtra",

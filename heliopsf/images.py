@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, overload
@@ -26,16 +26,14 @@ from heliopsf.inputs import (
     uncertainty_of,
 )
 from heliopsf.outputs import Deconvolution, in_form_of
-from heliopsf.parameters import NoiseFigures, Number, Progress, Steps, noise_of, number, reporter, whole
+from heliopsf.parameters import Options, Progress, Steps, noise_of, number, reporter, whole
 from heliopsf.psfs import AnyPsf, Psf, built_psf, given_psf
-from psfcore.deconvolve.box import LARGEST_ERROR
 from psfcore.deconvolve.camera_noise import measured_noise
 from psfcore.deconvolve.conditions import PreparedPsfs
 from psfcore.deconvolve.doubts import input_warnings
-from psfcore.deconvolve.edges import Edges
 from psfcore.deconvolve.methods.registry import properties_of
 from psfcore.deconvolve.run import BUILDING, DECONVOLVING, PsfSource, read_and_deconvolve
-from psfcore.deconvolve.work import Options
+from psfcore.deconvolve.work import Options as WorkOptions
 from psfcore.errors import DataError, DataWarning
 from psfcore.fits.frame import frame_of
 from psfcore.fits.header import seen_by
@@ -59,7 +57,7 @@ def deconvolve(smap: str | Path | Image, psf: AnyPsf | None = ..., **options: An
 def deconvolve(smap: Like, psf: AnyPsf | None = ..., **options: Any) -> Like: ...
 @overload
 def deconvolve(smap: Sequence[Any], psf: AnyPsf | None = ..., **options: Any) -> list[Any]: ...
-def deconvolve(  # type: ignore[misc]  # the overloads need not repeat the options
+def deconvolve(
     smap: Any,
     psf: AnyPsf | None = None,
     iterations: int | None = None,
@@ -67,33 +65,17 @@ def deconvolve(  # type: ignore[misc]  # the overloads need not repeat the optio
     use_gpu: bool = False,
     *,
     method: str = "richardson-lucy",
-    steps: int | None = None,
-    stop: str | None = None,
-    order: int | None = None,
-    smoothing: float | None = None,
-    noise: NoiseFigures | None = None,
-    error_draws: int = 0,
-    saturation_dn: Number | None = None,
-    hdu: int | None = None,
-    plate_scale_arcsec: Number | None = None,
-    edges: Edges | None = None,
-    margin_px: int | None = None,
-    region: Any = None,
-    region_error: Number = LARGEST_ERROR,
-    other_channel: bool = False,
-    again: bool = False,
     full: bool = False,
-    threads: int | None = None,
-    progress: Progress = None,
+    **options: Any,
 ) -> Any:
     """Deconvolve an image with the PSF of its telescope. The result has the form of the image.
 
         >>> import heliopsf, sunpy.map
         >>> image = sunpy.map.Map("aia.fits")
         >>> sharp = heliopsf.deconvolve(image)
+        >>> sharp = heliopsf.deconvolve(image, method="richardson-lucy-accelerated", steps=12, order=2, error_draws=8)
 
-    The first parameters are the same as in ``aiapy.psf.deconvolve``, so calls of that function work unchanged. A number may
-    be a quantity of astropy in a unit that fits.
+    The first five parameters are those of ``aiapy.psf.deconvolve``, so calls of that function work unchanged.
 
     Parameters
     ----------
@@ -104,8 +86,8 @@ def deconvolve(  # type: ignore[misc]  # the overloads need not repeat the optio
         A PSF, its FITS file, the name of a known instrument, an instrument file (TOML), or weights with their centre at
         [ny // 2, nx // 2]. Default: the PSF of the telescope in the header (``psf_for``), without its components. The
         PSF is rebinned if the image is binned.
-    iterations, steps : int, optional
-        Number of steps. Default: that of the method (Richardson-Lucy: 20; aiapy: 25).
+    iterations : int, optional
+        Number of steps, also called ``steps``. Default: that of the method (Richardson-Lucy: 20; aiapy: 25).
     clip_negative : bool, optional
         Whether pixels below 0 count as 0. The Richardson-Lucy methods always count them as 0; "linear" and "basic-iterative"
         do not by default.
@@ -113,44 +95,15 @@ def deconvolve(  # type: ignore[misc]  # the overloads need not repeat the optio
         Without effect, because heliopsf computes on the processor.
     method : str
         "richardson-lucy", "linear" or another method (docs/choose.md).
-    stop : {"fixed", "discrepancy"}, optional
-        "discrepancy": stop once the residual is like the noise; needs ``noise``.
-    order, smoothing : optional
-        Parameters of "richardson-lucy-accelerated" and "richardson-lucy-total-variation".
-    noise : (gain, read noise), optional
-        DN per photon and DN rms. Default: the uncertainty of an NDData, else published figures, else figures that are
-        measured in the image.
-    error_draws : int
-        Number of noise realisations (2 to 64) for the standard deviation of each pixel, the ``uncertainty`` of the
-        result; 8 is a good number. Each takes as long as a deconvolution. 0: no uncertainty.
-    saturation_dn : float or Quantity, optional
-        Pixels at or above this level (DN) are ignored. Default: the level that the header or the instrument file gives,
-        or that the pixels show.
-    hdu : int, optional
-        Number of the HDU with the image. Default: the first image.
-    plate_scale_arcsec : float or Quantity, optional
-        Plate scale of a PSF that gives none, arcsec/px.
-    edges : {"zero", "symmetric", "extended"}, optional
-        The scene beyond the field of view. Default: the assumption that suits the method best.
-    margin_px : int, optional
-        Width of the margin around the field of view in which the scene is also estimated.
-    region : str, slices or corners, optional
-        Deconvolve only a box of the image, which takes less time and memory: "x0:x1,y0:y1" in pixels,
-        ``np.s_[y0:y1, x0:x1]``, or for a Map its two corners as ``Map.submap`` takes them. Not with ``error_draws`` and
-        ``stop="discrepancy"``.
-    region_error : float
-        Bound of the difference from the whole image, as a share of the mean light of the region; it determines the rim that is
-        also deconvolved. The card DCNVBERR has the bound.
-    other_channel : bool
-        Whether the PSF may be of another telescope, channel or filter than the image.
-    again : bool
-        Deconvolve the image even if its header says that it is a product or a PSF.
     full : bool
         Return a ``Deconvolution`` for every form of image: pixels, QUALITY, errors, changes and plots.
-    threads : int, optional
-        Default: all cores. The number does not change the result.
-    progress : bool or function, optional
-        True, or a function that is called with (step, steps) after each step.
+    **options
+        Parameters of the method: ``steps``, ``stop`` ("fixed", or "discrepancy": stop once the residual is like the ``noise``), and its
+        own, such as ``order`` and ``smoothing``. All others are described by ``heliopsf.Options``:
+
+        - the image: ``hdu``, ``saturation_dn``, ``plate_scale_arcsec``, ``noise``, ``other_channel``, ``again``
+        - the result: ``region``, ``region_error``, ``error_draws``, ``edges``, ``margin_px``
+        - the run: ``threads``, ``progress``
 
     Returns
     -------
@@ -162,79 +115,76 @@ def deconvolve(  # type: ignore[misc]  # the overloads need not repeat the optio
     ------
     DataError
         Its ``code`` is the reason, such as "no-psf-for-instrument", "no-such-file", "already-deconvolved",
-        "plate-scale-mismatch", "channel-mismatch" or "unknown-method".
+        "plate-scale-mismatch", "channel-mismatch", "unknown-method" or "unknown-parameter".
 
     Warns
     -----
     DataWarning
         With its ``code``, for everything that may make the result wrong (docs/products.md lists the codes).
     """
-    if iterations is not None and steps is not None:
+    names = {one.name for one in fields(Options)}
+    given = Options(**{name: value for name, value in options.items() if name in names})
+    of_method = {name: value for name, value in options.items() if not (name in names or value is None)}
+    if iterations is not None and "steps" in of_method:
         raise DataError(
             "bad-steps", "expected iterations or steps; got both, which mean the same: give only one of them"
         )
-    steps = iterations if steps is None else steps
-    if steps is not None:
-        steps = whole("steps", steps, "bad-steps")
-    of_method = {"steps": steps, "stop": stop, "order": order, "smoothing": smoothing}
-    options = Options(
+    if (steps := of_method.get("steps", iterations)) is not None:
+        of_method["steps"] = whole("steps", steps, "bad-steps")
+    work = WorkOptions(
         method=method,
-        parameters={name: value for name, value in of_method.items() if value is not None},
-        edges=edges,
-        margin_px=margin_px,
-        noise=noise_of(noise),
-        error_draws=whole("error_draws", error_draws, "bad-draws"),
-        region_error=number("region_error", region_error, units.dimensionless_unscaled),
-        threads=cores() if threads is None else whole("threads", threads, "bad-threads"),
+        parameters=of_method,
+        edges=given.edges,
+        margin_px=given.margin_px,
+        noise=noise_of(given.noise),
+        error_draws=whole("error_draws", given.error_draws, "bad-draws"),
+        region_error=number("region_error", given.region_error, units.dimensionless_unscaled),
+        threads=cores() if given.threads is None else whole("threads", given.threads, "bad-threads"),
     )
-    scale = (
-        None
-        if plate_scale_arcsec is None
-        else number("plate_scale_arcsec", plate_scale_arcsec, units.arcsec / units.pix, units.arcsec)
-    )
+    scale = given.plate_scale_arcsec
+    if scale is not None:
+        scale = number("plate_scale_arcsec", scale, units.arcsec / units.pix, units.arcsec)
 
     def begin(stage: str, _steps: int) -> Steps | None:
-        return reporter(progress if stage == DECONVOLVING else progress is True, stage)
+        return reporter(given.progress if stage == DECONVOLVING else given.progress is True, stage)
 
     source = partial(
         PsfSource,
-        possible_psfs=partial(possible_on_pixels, threads=options.threads),
+        possible_psfs=partial(possible_on_pixels, threads=work.threads),
         plate_scale_arcsec=scale,
         prepared=PreparedPsfs(),
-        other_channel=other_channel,
+        other_channel=given.other_channel,
     )
     if psf is None:
-        of_image = source(partial(_built_for, threads=options.threads, parts=False))
+        of_image = source(partial(_built_for, threads=work.threads, parts=False))
     else:
-        given = given_psf(psf, threads=options.threads, progress=begin(BUILDING, 1))
-        of_image = source(lambda *_: given, key=id(given), kernel_shape=given.kernel.shape)
+        own = given_psf(psf, threads=work.threads, progress=begin(BUILDING, 1))
+        of_image = source(lambda *_: own, key=id(own), kernel_shape=own.kernel.shape)
 
     def one(image: Any) -> Any:
-        box = None if region is None else box_of(region, image, hdu)
-        sigma = None if noise is not None else uncertainty_of(image)
-        if sigma is not None and not error_draws:
+        box = None if given.region is None else box_of(given.region, image, given.hdu)
+        sigma = None if work.noise is not None else uncertainty_of(image)
+        if sigma is not None and not work.error_draws:
             message = "the uncertainty of the image is not used: error_draws=8 uses it as the noise, and gives it back"
             warnings.warn(DataWarning("uncertainty-dropped", message), stacklevel=3)
             sigma = None
 
         def read() -> Image:
-            return image_of(image, saturation=saturation_dn, hdu=hdu)
+            return image_of(image, saturation=given.saturation_dn, hdu=given.hdu)
 
         product, _ = read_and_deconvolve(
             read,
             of_image,
-            replace(
-                options, region=box, noise=options.noise if sigma is None else measured_noise(read(), sigma)
-            ),
-            shape=shape_of(image, hdu),
+            replace(work, region=box, noise=work.noise if sigma is None else measured_noise(read(), sigma)),
+            shape=shape_of(image, given.hdu),
             free_bytes=free_bytes(),
-            again=again,
+            again=given.again,
             clip=partial(_clipped, clip_negative=clip_negative, method=method),
             begin=begin,
             say=lambda code, message: warnings.warn(DataWarning(code, message), stacklevel=5),
         )
         result = Deconvolution(**vars(product) | {"psf": Psf.of(product.psf)})
-        return result if full else in_form_of(image if box is None else cut(image, box, hdu), result)
+        return result if full else in_form_of(image if box is None else cut(image, box, given.hdu), result)
 
     if not is_many(smap):
         with on_disk(smap) as image:

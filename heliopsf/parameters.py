@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 from astropy import units
 
+from psfcore.deconvolve.box import LARGEST_ERROR
+from psfcore.deconvolve.declaration import Edges
 from psfcore.errors import DataError
 from psfcore.fits.header import optional_exposure_s
 from psfcore.noise import Noise
@@ -22,6 +25,63 @@ Steps = Callable[[int, int], None]
 # True: show a line on standard error; a function: call it with (step, steps); None, False: show nothing.
 Progress = Steps | bool | None
 Stages = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Keywords of ``deconvolve`` that all methods have. A number may be a quantity of astropy in a unit that fits.
+
+    Parameters
+    ----------
+    hdu : int, optional
+        Number of the HDU with the image. Default: the first image.
+    saturation_dn : float or Quantity, optional
+        Pixels at or above this level (DN) are ignored. Default: the level that the header or the instrument file gives,
+        or that the pixels show.
+    plate_scale_arcsec : float or Quantity, optional
+        Plate scale of a PSF that gives none, arcsec/px.
+    noise : (gain, read noise), optional
+        DN per photon and DN rms. Default: the uncertainty of an NDData, else published figures, else figures that are
+        measured in the image.
+    other_channel : bool
+        Whether the PSF may be of another telescope, channel or filter than the image.
+    again : bool
+        Deconvolve the image even if its header says that it is a product or a PSF.
+    region : str, slices or corners, optional
+        Deconvolve only a box of the image, which takes less time and memory: "x0:x1,y0:y1" in pixels,
+        ``np.s_[y0:y1, x0:x1]``, or for a Map its two corners as ``Map.submap`` takes them. Not with ``error_draws`` and
+        ``stop="discrepancy"``.
+    region_error : float
+        Bound of the difference from the whole image, as a share of the mean light of the region; it determines the rim that is
+        also deconvolved. The card DCNVBERR has the bound.
+    error_draws : int
+        Number of noise realisations (2 to 64) for the standard deviation of each pixel, the ``uncertainty`` of the
+        result; 8 is a good number. Each takes as long as a deconvolution. 0: no uncertainty.
+    edges : {"zero", "symmetric", "extended"}, optional
+        The scene beyond the field of view. Default: the assumption that suits the method best.
+    margin_px : int, optional
+        Width of the margin around the field of view in which the scene is also estimated.
+    threads : int, optional
+        Default: all cores. The number does not change the result.
+    progress : bool or function, optional
+        True, or a function that is called with (step, steps) after each step.
+    """
+
+    hdu: int | None = None
+    saturation_dn: Number | None = None
+    plate_scale_arcsec: Number | None = None
+    noise: NoiseFigures | None = None
+    other_channel: bool = False
+    again: bool = False
+    region: Any = None
+    region_error: Number = LARGEST_ERROR
+    error_draws: int = 0
+    edges: Edges | None = None
+    margin_px: int | None = None
+    threads: int | None = None
+    progress: Progress = None
+
+
 # Three names of the number of the A/D converter.
 COUNTS = (units.DN, units.adu, units.ct)
 

@@ -29,7 +29,7 @@ from workers.contract.kinds import JobRequest
 from workers.files.store import Store
 from workers.intake.compatibility import details_now
 from workers.intake.requests import resolve
-from workers.intake.uploads import image_row, transit_row, uploaded_psf_row
+from workers.intake.uploads import Upload, image_row, transit_row, uploaded_psf_row
 from workers.rows import row_of
 from workers.run.attempt import Attempt
 from workers.run.runner import Runner
@@ -66,14 +66,14 @@ class InProcess(Operations):
     def close(self) -> None:
         self.catalogue.close()
 
-    def _kept(self, path: Path) -> tuple[str, str, int, str]:
-        """Copy a file into the store: the first columns of its row."""
+    def _kept(self, path: Path) -> Upload:
+        """Copy a file into the store."""
         with self.store.temporary() as copy:
             shutil.copyfile(path, copy)
-            return DEFAULT_OWNER, self.store.keep(copy), path.stat().st_size, path.name
+            return Upload(DEFAULT_OWNER, self.store.keep(copy), path.stat().st_size, path.name)
 
     def upload_image(self, path: str | Path) -> dict[str, Any]:
-        row = image_row(*self._kept(Path(path)), read_summary(path, self._limits))
+        row = image_row(self._kept(Path(path)), read_summary(path, self._limits))
         self.catalogue.add(row)
         return {"id": row.id, "header": row.summary}
 
@@ -82,13 +82,13 @@ class InProcess(Operations):
         if archive.is_dir():
             archive = self.settings.data_dir / f"{archive.name}.tar"
             pack(path, archive)
-        row = transit_row(*self._kept(archive), list_archive(archive, self.settings.archive_limits))
+        row = transit_row(self._kept(archive), list_archive(archive, self.settings.archive_limits))
         return {"id": self.catalogue.add(row)[0].id}
 
     def upload_psf(self, path: str | Path, **described: Any) -> dict[str, Any]:
         summary = read_summary(path, self._limits)
         check_is_psf(path, summary, self._limits)
-        row = uploaded_psf_row(*self._kept(Path(path)), summary, **described)
+        row = uploaded_psf_row(self._kept(Path(path)), summary, **described)
         if not any(described.values()):
             row.id = stated_id(path, self._limits) or row.id
         return PsfView.of(self.catalogue.add(row)[0]).model_dump(mode="json")

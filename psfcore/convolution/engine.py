@@ -25,15 +25,14 @@ import math
 import queue
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.compiled import compiled
-from psfcore.convolution.fft_kernels import LANES, forward, inverse, make_plan
+from psfcore.convolution.fft_kernels import LANES, Plan, forward, inverse, make_plan
 from psfcore.convolution.lanes import join, scale, split, transpose, turn, turn_back
 from psfcore.convolution.lengths import good_length
 from psfcore.convolution.offsets import needed_kernel
@@ -53,12 +52,21 @@ _BLOCKS_A_CHUNK = 8
 Single = NDArray[np.float32]
 
 
-@dataclass(frozen=True, eq=False)
-class Scratch:
+class Scratch(NamedTuple):
     """Working memory of one thread: the buffer of a transform, and a small array in which blocks are transposed."""
 
     buffer: Single
     corner: Single
+
+
+class Lines(NamedTuple):
+    """The rows or columns of a spectrum for a kernel, which takes them as one argument: with the working memory of a
+    thread and the plan of the transform."""
+
+    spectrum: Single
+    buffer: Single
+    corner: Single
+    plan: Plan
 
 
 class Engine:
@@ -186,21 +194,11 @@ class Engine:
 
     def rows_forward(self, lanes: Single) -> None:
         """Transform the rows of a field into the spectrum."""
-        spectrum = self._spectrum
-
-        def work(start: int, stop: int, scratch: Scratch) -> None:
-            _rows_forward(lanes, spectrum, 0, scratch.buffer, scratch.corner, start, stop, *self.row_numbers)
-
-        self.run(work, self.row_blocks)
+        self.row_stage(_rows_forward, lanes, 0)
 
     def rows_inverse(self, lanes: Single) -> None:
         """Transform the spectrum's rows back into a field."""
-        spectrum = self._spectrum
-
-        def work(start: int, stop: int, scratch: Scratch) -> None:
-            _rows_inverse(lanes, spectrum, scratch.buffer, scratch.corner, start, stop, *self.row_numbers)
-
-        self.run(work, self.row_blocks)
+        self.row_stage(_rows_inverse, lanes)
 
     def columns(self, *, adjoint: bool) -> None:
         """Transform the columns, multiply by the transfer function, and transform back. adjoint: multiply by its
@@ -212,32 +210,20 @@ class Engine:
 
         conjugate: multiply by the complex conjugate of the filter.
         """
-        kernel = _columns_real if transfer.shape[2] == 1 else _columns_complex
-        sign = np.float32(-1.0 if conjugate else 1.0)
-        spectrum = self._spectrum
+        self._stage(_columns, self.column_plan, self.column_blocks, transfer, conjugate)
 
-        def work(start: int, stop: int, scratch: Scratch) -> None:
-            kernel(spectrum, transfer, sign, scratch.buffer, start, stop, *self.column_plan.numbers)
+    def row_stage(self, kernel: Callable[..., None], *fields: Any) -> None:
+        """Run the compiled row function of a method on all blocks: `kernel(lines, start, stop, *fields)`.
 
-        self.run(work, self.column_blocks)
-
-    def row_stage(self, work: Callable[..., Any], *fields: Any) -> list[Any]:
-        """Run `work`, the compiled row function of a method, on all blocks; returns one result per chunk.
-
-        `work` gets the spectrum, the fields, `buffer` and `corner` of the thread's `Scratch`, the range of blocks, and
-        `row_numbers`.
+        lines: the rows, with the working memory of the thread. start, stop: the range of blocks.
         """
+        self._stage(kernel, self.row_plan, self.row_blocks, *fields)
+
+    def _stage(self, kernel: Callable[..., None], plan: Plan, blocks: int, *fields: Any) -> None:
         spectrum = self._spectrum
-
-        def part(start: int, stop: int, scratch: Scratch) -> Any:
-            return work(spectrum, *fields, scratch.buffer, scratch.corner, start, stop, *self.row_numbers)
-
-        return self.run(part, self.row_blocks)
-
-    @property
-    def row_numbers(self) -> tuple[Any, ...]:
-        """The row plan as arguments of a compiled kernel."""
-        return (*self.row_plan.numbers, self.row_plan.place)
+        self.run(
+            lambda start, stop, scratch: kernel(Lines(spectrum, *scratch, plan), start, stop, *fields), blocks
+        )
 
     def run(self, work: Callable[[int, int, Scratch], Any], blocks: int) -> list[Any]:
         """Call `work(start, stop, scratch)` on ranges that cover all blocks, using all threads."""
@@ -299,11 +285,11 @@ class Engine:
                 here = slice(block * BLOCK_ROWS, (block + 1) * BLOCK_ROWS)
                 rows = _wrapped_rows(kernel, first, (ly, lx), here) * np.float32(1 / self.transfer_scale)
                 lanes = np.ascontiguousarray(rows.reshape(1, 2, LANES, lx).transpose(0, 3, 1, 2))
-                _rows_forward(lanes, transfer, block, scratch.buffer, scratch.corner, 0, 1, *self.row_numbers)
+                _rows_forward(Lines(transfer, *scratch, self.row_plan), 0, 1, lanes, block)
 
         def along_columns(start: int, stop: int, _scratch: Scratch) -> None:
             for block in range(start, stop):
-                forward(transfer[block, :ly].reshape(-1), *self.column_plan.numbers)
+                forward(transfer[block, :ly].reshape(-1), self.column_plan)
 
         self.run(along_rows, blocks)
         self.run(along_columns, self.column_blocks)
@@ -347,12 +333,16 @@ def _wrapped_rows(
 
 
 @compiled()
-def spectrum_from_buffer(spectrum, buffer, corner, block, length, place):  # type: ignore[no-untyped-def]
-    """Separate a transformed block of rows into the spectra of its 32 rows.
+def rows_to_spectrum(lines, block, nx):  # type: ignore[no-untyped-def]
+    """Transform the block of rows that the buffer holds, `nx` px long, and separate it into the spectra of its 32 rows.
 
     Each complex signal of the block contains two real rows. If Z is the transform of a + i b with real a and b, then
     A[k] = (Z[k] + Z*[L-k]) / 2, B[k] = (Z[k] - Z*[L-k]) / (2 i).
     """
+    spectrum, buffer, corner = lines.spectrum, lines.buffer, lines.corner
+    length, place = lines.plan.length, lines.plan.place
+    _clear(buffer, nx * _SIZE, length)
+    forward(buffer, lines.plan)
     last = length // 2
     rows = spectrum.shape[1]
     for group in range(spectrum.shape[0]):
@@ -369,11 +359,14 @@ def spectrum_from_buffer(spectrum, buffer, corner, block, length, place):  # typ
 
 
 @compiled()
-def buffer_from_spectrum(spectrum, buffer, corner, block, length, place):  # type: ignore[no-untyped-def]
-    """Join the spectra of 32 rows to a block that the inverse transform turns into these rows.
+def rows_from_spectrum(lines, block):  # type: ignore[no-untyped-def]
+    """Transform a block of 32 rows back into the buffer, and return the buffer as [x, half, lane].
 
-    Z[k] = A[k] + i B[k] and Z[L-k] = A*[k] + i B*[k], the inverse of ``spectrum_from_buffer``.
+    The spectra of the rows are joined first: Z[k] = A[k] + i B[k] and Z[L-k] = A*[k] + i B*[k], the inverse of
+    ``rows_to_spectrum``.
     """
+    spectrum, buffer, corner = lines.spectrum, lines.buffer, lines.corner
+    length, place = lines.plan.length, lines.plan.place
     last = length // 2
     rows = spectrum.shape[1]
     for group in range(spectrum.shape[0]):
@@ -384,71 +377,58 @@ def buffer_from_spectrum(spectrum, buffer, corner, block, length, place):  # typ
         for k in range(group * LANES, min((group + 1) * LANES, last + 1)):
             at = (k - group * LANES) * 2 * _SIZE
             join(corner, buffer, at, place[k] * _SIZE, place[(length - k) % length] * _SIZE)
+    inverse(buffer, lines.plan)
+    return buffer.reshape((-1, 2, LANES))
 
 
 # An assignment between slices of arrays would compile five seconds longer, because of its check of the shapes.
 
 
 @compiled()
-def _fill(buffer, values, filled, length):  # type: ignore[no-untyped-def]
-    """Copy the first `filled` values into the buffer of a transform, and set the rest of the buffer to 0."""
-    for n in range(filled):
-        buffer[n] = values[n]
-    for n in range(filled, length * 2 * LANES):
-        buffer[n] = np.float32(0.0)
+def _copy(values, target, count):  # type: ignore[no-untyped-def]
+    for n in range(count):
+        target[n] = values[n]
 
 
 @compiled()
-def _rows_forward(lanes, spectrum, first_block, buffer, corner, start, stop, length, passes, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
+def _clear(buffer, filled, length):  # type: ignore[no-untyped-def]
+    """Set the buffer of a transform to 0 beyond its first `filled` numbers."""
+    buffer[filled : length * _SIZE] = np.float32(0.0)
+
+
+@compiled()
+def _rows_forward(lines, start, stop, lanes, first_block):  # type: ignore[no-untyped-def]
     """Transform the rows of blocks. first_block: the block of the spectrum to which block 0 of `lanes` belongs."""
-    filled = lanes.shape[1] * 2 * LANES
+    nx = lanes.shape[1]
     for block in range(start, stop):
-        _fill(buffer, lanes[block].reshape(-1), filled, length)
-        forward(buffer, length, passes, lengths, tw, offsets)
-        spectrum_from_buffer(spectrum, buffer, corner, first_block + block, length, place)
+        _copy(lanes[block].reshape(-1), lines.buffer, nx * _SIZE)
+        rows_to_spectrum(lines, first_block + block, nx)
 
 
 @compiled()
-def _rows_inverse(lanes, spectrum, buffer, corner, start, stop, length, passes, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]
-    filled = lanes.shape[1] * 2 * LANES
+def _rows_inverse(lines, start, stop, lanes):  # type: ignore[no-untyped-def]
     for block in range(start, stop):
-        buffer_from_spectrum(spectrum, buffer, corner, block, length, place)
-        inverse(buffer, length, passes, lengths, tw, offsets)
-        values = lanes[block].reshape(-1)
-        for n in range(filled):
-            values[n] = buffer[n]
+        rows_from_spectrum(lines, block)
+        _copy(lines.buffer, lanes[block].reshape(-1), lanes.shape[1] * _SIZE)
 
 
 @compiled()
-def _columns_real(spectrum, transfer, _sign, buffer, start, stop, length, passes, lengths, tw, offsets):  # type: ignore[no-untyped-def]
+def _columns(lines, start, stop, transfer, conjugate):  # type: ignore[no-untyped-def]
+    """Multiply columns by the transfer function, real or complex, or by its conjugate."""
+    buffer, length = lines.buffer, lines.plan.length
     # A block may have more rows than the transform; the rows beyond the transform are padding and stay zero.
-    filled = min(spectrum.shape[1], length) * _SIZE
+    filled = min(lines.spectrum.shape[1], length) * _SIZE
     for group in range(start, stop):
-        column = spectrum[group].reshape(-1)
-        _fill(buffer, column, filled, length)
-        forward(buffer, length, passes, lengths, tw, offsets)
+        column = lines.spectrum[group].reshape(-1)
+        _copy(column, buffer, filled)
+        _clear(buffer, filled, length)
+        forward(buffer, lines.plan)
         for k in range(length):
-            scale(buffer, transfer, k * _SIZE, (group * length + k) * LANES)
-        inverse(buffer, length, passes, lengths, tw, offsets)
-        for n in range(filled):
-            column[n] = buffer[n]
-
-
-@compiled()
-def _columns_complex(spectrum, transfer, sign, buffer, start, stop, length, passes, lengths, tw, offsets):  # type: ignore[no-untyped-def]
-    """As `_columns_real`, for an asymmetric PSF. sign: 1; or -1, which multiplies by the conjugate (for the
-    adjoint)."""
-    # A block may have more rows than the transform; the rows beyond the transform are padding and stay zero.
-    filled = min(spectrum.shape[1], length) * _SIZE
-    for group in range(start, stop):
-        column = spectrum[group].reshape(-1)
-        _fill(buffer, column, filled, length)
-        forward(buffer, length, passes, lengths, tw, offsets)
-        for k in range(length):
-            if sign > 0:
-                turn(buffer, transfer, k * _SIZE, (group * length + k) * _SIZE)
-            else:
+            if transfer.shape[2] == 1:
+                scale(buffer, transfer, k * _SIZE, (group * length + k) * LANES)
+            elif conjugate:
                 turn_back(buffer, transfer, k * _SIZE, (group * length + k) * _SIZE)
-        inverse(buffer, length, passes, lengths, tw, offsets)
-        for n in range(filled):
-            column[n] = buffer[n]
+            else:
+                turn(buffer, transfer, k * _SIZE, (group * length + k) * _SIZE)
+        inverse(buffer, lines.plan)
+        _copy(buffer, column, filled)

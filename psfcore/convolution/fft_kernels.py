@@ -3,7 +3,7 @@
 These are mixed-radix Cooley-Tukey transforms in place. The forward transform decimates in frequency; its input is in
 natural order and its output in digit-reversed order. The inverse decimates in time, from digit-reversed back to natural
 order. A convolution multiplies the two spectra between these transforms, so the frequencies need not be sorted.
-`Plan.frequency` gives the frequency of each index.
+`Plan.place` gives the index of each frequency.
 
 Sixteen signals ("lanes") are stored side by side, so each butterfly is one operation on sixteen neighbours. A buffer is
 a flat float32 array, [index][re, im][lane]. A butterfly is written down as vector instructions (`_butterfly`). If it were
@@ -24,9 +24,8 @@ The inverse of Eq. (1), times L, is the same transform with real and imaginary p
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from llvmlite import ir
@@ -47,29 +46,19 @@ _PASS = types.void(types.CPointer(types.float32), types.CPointer(types.float32),
 Flat = NDArray[np.float32]
 
 
-@dataclass(frozen=True, eq=False)
-class Plan:
-    """How to transform signals of one length: radix and length of each pass, twiddle factors, and order of the result.
+class Plan(NamedTuple):
+    """How to transform signals of one length, as one argument of the kernels: passes, twiddle factors, and order of the result.
 
-    `passes[0]` and `passes[1]` hold the addresses of the passes of `forward` and `inverse`.
-
-    `frequency[i]` is the frequency at index i after a forward transform. `place` is the inverse permutation:
-    `place[k]` is the index of frequency k.
+    `passes[0]` and `passes[1]` hold the addresses of the passes of `forward` and `inverse`, `lengths` the lengths of
+    their blocks. `place[k]` is the index of frequency k after a forward transform.
     """
 
     length: int
-    radices: NDArray[np.int64]
     passes: NDArray[np.int64]
     lengths: NDArray[np.int64]
     twiddles: Flat
     offsets: NDArray[np.int64]
-    frequency: NDArray[np.int64]
     place: NDArray[np.int64]
-
-    @property
-    def numbers(self) -> tuple[Any, ...]:
-        """The arguments of `forward` and `inverse` after the buffer."""
-        return self.length, self.passes, self.lengths, self.twiddles, self.offsets
 
 
 @lru_cache(maxsize=16)
@@ -96,7 +85,6 @@ def make_plan(length: int) -> Plan:
     place[frequency] = np.arange(length)
     return Plan(
         length=length,
-        radices=np.array(radices, dtype=np.int64),
         passes=np.array(
             [[kernels[radix].address for radix in radices] for kernels in (_FORWARD, _INVERSE)],
             dtype=np.int64,
@@ -104,7 +92,6 @@ def make_plan(length: int) -> Plan:
         lengths=np.array(lengths, dtype=np.int64),
         twiddles=np.concatenate(twiddles),
         offsets=np.array(offsets, dtype=np.int64),
-        frequency=frequency,
         place=place,
     )
 
@@ -245,14 +232,18 @@ def _call(_typing, address, x, twiddles, length, n):  # type: ignore[no-untyped-
 
 
 @compiled()
-def forward(x, length, passes, lengths, twiddles, offsets):  # type: ignore[no-untyped-def]
-    """Compute Eq. (1) for sixteen lanes, in place. The result is in the order of `Plan.frequency`."""
-    for stage in range(lengths.size):
-        _call(passes[0, stage], x, twiddles[offsets[stage] :], length, lengths[stage])
+def forward(x, plan):  # type: ignore[no-untyped-def]
+    """Compute Eq. (1) for sixteen lanes, in place. The frequency k is at index `plan.place[k]` of the result."""
+    for stage in range(plan.lengths.size):
+        _call(
+            plan.passes[0, stage], x, plan.twiddles[plan.offsets[stage] :], plan.length, plan.lengths[stage]
+        )
 
 
 @compiled()
-def inverse(x, length, passes, lengths, twiddles, offsets):  # type: ignore[no-untyped-def]
+def inverse(x, plan):  # type: ignore[no-untyped-def]
     """Compute `length` times the inverse of `forward`, in place. The result is in natural order."""
-    for stage in range(lengths.size - 1, -1, -1):
-        _call(passes[1, stage], x, twiddles[offsets[stage] :], length, lengths[stage])
+    for stage in range(plan.lengths.size - 1, -1, -1):
+        _call(
+            plan.passes[1, stage], x, plan.twiddles[plan.offsets[stage] :], plan.length, plan.lengths[stage]
+        )

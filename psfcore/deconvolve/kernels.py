@@ -55,8 +55,7 @@ def compile_kernels(method: str, shape: tuple[int, int]) -> None:
     The margin of the image, and so the length of its transforms, depends on the PSF, which does not exist yet. The usual
     length is taken; if another one is needed, at most two passes are compiled later.
     """
-    # The kernel is not symmetric, as that of most PSFs: there are other kernels for symmetric ones.
-    weights = np.random.default_rng(0).random((SIZE_PX, SIZE_PX))
+    weights = np.ones((SIZE_PX, SIZE_PX))
     weights[SIZE_PX // 2, SIZE_PX // 2] = SIZE_PX**2
     psf = Psf(kernel=weights / weights.sum(), name="small", version="0", instrument=None, status="user")
     pixels = np.full((SIZE_PX, SIZE_PX), 100.0)

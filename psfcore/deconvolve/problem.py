@@ -19,7 +19,7 @@ of the light may come from beyond the field, which the model does not contain.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,32 +78,26 @@ def relative_change(moved: float, total: float) -> float:
     return float(np.sqrt(moved / total)) if total > 0 else 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class Judgement:
-    """The judged pixels of Eq. (1) and their variance, in the layout that the compiled kernels need.
+class Judgement(NamedTuple):
+    """The judged pixels of Eq. (1) and their variance, as one argument of the compiled kernels.
 
     rows [block][half][lane]: 1 for a judged row, else 0. first, last: judged columns, from `first` to `last` - 1.
-    count: n. slope, ground: terms of the variance in the domain's scaled unit. sums: for each block of rows, the sum of
+    pixels: n. slope, ground: terms of the variance in the domain's scaled unit. sums: for each block of rows, the sum of
     Eq. (1) without the factor 1/n.
     """
 
     rows: NDArray[np.float32]
     first: int
     last: int
-    count: int
+    pixels: int
     slope: np.float32
     ground: np.float32
     sums: NDArray[np.float64]
 
     @property
-    def numbers(self) -> tuple[Any, ...]:
-        """These values as arguments of a compiled kernel."""
-        return self.rows, self.first, self.last, self.slope, self.ground, self.sums
-
-    @property
     def chi2(self) -> float:
         """The chi2 of Eq. (1), of the model image that was computed last."""
-        return float(self.sums.sum()) / max(self.count, 1)
+        return float(self.sums.sum()) / max(self.pixels, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +149,7 @@ class Problem:
         After a fixed number of steps, chi2 belongs to the estimate before the last step.
         """
         judgement, steps, progress = self.judgement, self.steps, self.conditions.progress
-        judged = self.conditions.noise is not None and judgement.count > 0
+        judged = self.conditions.noise is not None and judgement.pixels > 0
         if self.stop == "discrepancy" and not judged:
             raise no_noise_model()
         for step in range(1, steps + 1):
@@ -214,7 +208,7 @@ def _judgement(
         rows=rows.reshape(engine.row_blocks, *engine.lanes_shape[2:]),
         first=left + band,
         last=left + nx - band,
-        count=int(np.count_nonzero(image.valid[judged])),
+        pixels=int(np.count_nonzero(image.valid[judged])),
         slope=np.float32(slope / domain.scale),
         ground=np.float32((read_noise / domain.scale) ** 2),
         sums=np.zeros(engine.row_blocks),

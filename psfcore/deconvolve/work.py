@@ -147,23 +147,20 @@ class Work:
         PSF if the errors are not known. begin(stage, steps) is called when a stage begins, and returns the progress
         function of the stage.
         """
-        noise, draws = self.options.noise, self.options.error_draws
-        assert noise is not None
         # Most deconvolutions compute no errors, and do not load SciPy.
         from psfcore.deconvolve.assess.error_planes import error_planes, spread_of_results
 
-        progress = begin(ERROR_ESTIMATE, draws)
+        progress = begin(ERROR_ESTIMATE, self.options.error_draws)
+        # The first run deconvolves the model image without noise.
+        told = None if progress is None else lambda done, of: progress(done - 1, of - 1)
         planes = error_planes(
             self.image,
             self.psf,
             lambda image: self.run(image).pixels,
-            noise,
+            replace(self.options, progress=told),
             estimate=result.pixels,
-            draws=draws,
+            draws=self.options.error_draws,
             edge_px=result.edge_band_px,
-            threads=self.options.threads,
-            # The first run deconvolves the model image without noise.
-            progress=None if progress is None else lambda done, of: progress(done - 1, of - 1),
         )
         psfs = possible_psfs()
         if not psfs:

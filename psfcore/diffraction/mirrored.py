@@ -121,7 +121,7 @@ class MirroredTransforms:
                 last = min(first + BLOCK, self.mask.cells)
                 _fill_lanes(self.mask.rows(first, last, out=scratch.strip), self.cells, scratch.lanes)
                 for field, turn in zip(fields, turns, strict=False):
-                    _transform(scratch.lanes, self.cells, turn, scratch.buffer, *self.plan.numbers)
+                    _transform(scratch.lanes, self.cells, turn, scratch.buffer, self.plan)
                     _keep_field(scratch.buffer, self._at, self._turn, field, block * BLOCK, scratch.corner)
 
         self._run(work, self.row_blocks)
@@ -132,7 +132,7 @@ class MirroredTransforms:
 
         def work(start: int, stop: int, scratch: _Buffers) -> None:
             for block in range(start, stop):
-                _transform(field[block], self.cells, turn, scratch.buffer, *self.plan.numbers)
+                _transform(field[block], self.cells, turn, scratch.buffer, self.plan)
                 _add_intensity(scratch.buffer, self._at, self._turn, total[block], place.weight)
 
         self._run(work, self.column_blocks)
@@ -194,12 +194,12 @@ def _fill_lanes(strip, first, lanes):  # type: ignore[no-untyped-def]
 
 
 @compiled(fastmath=_FAST)
-def _transform(lanes, cells, turn, buffer, length, passes, lengths, tw, offsets):  # type: ignore[no-untyped-def]
+def _transform(lanes, cells, turn, buffer, plan):  # type: ignore[no-untyped-def]
     """Compute the sum of Eq. (3) into `buffer`, from the `cells` first rows of `lanes`.
 
     turn[i]: the factor of cell i in Eq. (2), for i < cells; 0 for the further cells that complete a round.
     """
-    x, z = lanes.reshape(-1), buffer
+    x, z, length = lanes.reshape(-1), buffer, plan.length
     half = length // 2
     size = 2 * LANES
     for n in range(z.size):
@@ -232,7 +232,7 @@ def _transform(lanes, cells, turn, buffer, length, passes, lengths, tw, offsets)
             z[a + v] = ai + br
             z[b + w] = ar + bi
             z[b + v] = br - ai
-    forward(buffer, length, passes, lengths, tw, offsets)
+    forward(buffer, plan)
 
 
 @compiled(fastmath=_FAST)

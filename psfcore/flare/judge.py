@@ -40,14 +40,14 @@ def judge_on_flare(
     before: Image,
     psf: Psf,
     *,
-    centre_xy: tuple[int, int] | None = None,
+    centre_xy: tuple[float, float] | None = None,
     arm_deg: float | None = None,
     distances_px: tuple[float, float] = (10.0, 80.0),
     noise: Noise | None = None,
 ) -> FlareTest:
     """Simulate the stray light of a flare with ``psf``, and compare it with the observed light along a diffraction arm.
 
-    centre_xy: position of the flare, px; default: it is found in the images. arm_deg: direction of the arm, from +x
+    centre_xy: position of the flare, px, which is rounded; default: it is found in the images. arm_deg: direction of the arm, from +x
     towards +y; default: it is measured, and the arm nearest to +x is used. noise: the noise of the camera; chi2 is
     computed only if it is given.
     Raises DataError "plate-scale-mismatch", "flare-shapes", "flare-units", and the errors of ``compare_on_flare`` and
@@ -56,7 +56,8 @@ def judge_on_flare(
     check_compatible(flaring, psf)
     light, quiet, unit = _same_unit(flaring, before)
     difference, usable = light - quiet, flaring.valid & before.valid
-    found_at = centre_xy or flare_centre(difference, flaring.valid, before.valid)
+    x, y = centre_xy or flare_centre(difference, flaring.valid, before.valid)
+    found_at = round(x), round(y)
     if arm_deg is None:
         arm_deg = _measured_arm(light, quiet, usable, found_at, distances_px[1])
     found = compare_on_flare(

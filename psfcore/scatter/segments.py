@@ -38,6 +38,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,9 +69,8 @@ def shells_as_published(reach_px: float = FULL_REACH_PX) -> tuple[float, ...]:
     return (*_PUBLISHED_CORE_PX, *np.arange(6.0, 10.0).tolist(), *tail[:-1].tolist(), reach_px)
 
 
-@dataclass(frozen=True, eq=False)
-class Runs:
-    """The segments as runs of adjacent pixels, row by row.
+class Runs(NamedTuple):
+    """The segments as runs of adjacent pixels, row by row; a kernel takes them as one argument.
 
     Run i contains the offsets dx_start[i] <= dx < dx_stop[i]; they belong to the segment with the index segment[i]. The
     runs of row dy are sorted by dx. Their indices begin at row[dy - first_dy] and end before row[dy - first_dy + 1].
@@ -195,14 +195,13 @@ def segment_sums(
     # The x indices at which the strips read P. All threads use the same, because the first determines the rounding.
     first = int(strip_yx[:, 1].min() - runs.dx_stop.max() + 1)
     places = int(strip_yx[:, 1].max() + LANES - runs.dx_start.min()) + 1 - first
-    of_row = (runs.first_dy, runs.row, runs.dx_start, runs.dx_stop, runs.segment)
 
     def work(part: slice) -> None:
         mine = slice(*np.searchsorted(strip, (part.start, part.stop)))
         lane = ordered[mine, 1] - strip_yx[strip[mine], 1]
         lanes = -(-(int(lane.max()) + 1) // _VECTOR) * _VECTOR
         sums = np.zeros((part.stop - part.start, segments.size, lanes))
-        _accumulate(image, strip_yx[part], *of_row, first, np.zeros((_ROWS, places)), sums)
+        _accumulate(image, strip_yx[part], runs, first, np.zeros((_ROWS, places)), sums)
         out[order[mine]] = sums[strip[mine] - part.start, :, lane]
 
     # Each thread gets about equally many strips: in one part, or in more if the sums of one part would be too large.
@@ -254,8 +253,9 @@ def _running_sums(image, top, first, running):  # type: ignore[no-untyped-def]
 
 
 @compiled()
-def _accumulate(image, strip_yx, first_dy, row, dx_start, dx_stop, segment, first, running, sums):  # type: ignore[no-untyped-def]
-    ny, lanes = image.shape[0], sums.shape[2]
+def _accumulate(image, strip_yx, runs, first, running, sums):  # type: ignore[no-untyped-def]
+    ny, lanes, first_dy = image.shape[0], sums.shape[2], runs.first_dy
+    row, dx_start, dx_stop, segment = runs.row, runs.dx_start, runs.dx_stop, runs.segment
     rows_of_runs = len(row) - 1
     lowest_y, highest_y = strip_yx[0, 0], strip_yx[-1, 0]
     # dy = y - source y

@@ -16,7 +16,7 @@ from click.shell_completion import CompletionItem
 from psfcore.errors import did_you_mean
 from psfcore.instruments.files import instrument_names
 from psfcore.published_psfs import PUBLISHED, kept_file
-from service.cli.options import options_of, user_errors
+from service.cli.options import LOCAL, is_local, kept, options_of, user_errors
 from service.cli.progress import echo, say
 from service.client.errors import DEFAULT_SERVER, SHOWN_DIGITS
 from service.client.operations import Operations
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from service.client.http import Client
 
 _KEY = "heliopsf.key"
+CHOSEN_SERVER = "heliopsf.server"  # where the context of a command has the address
 DIGITS = 64  # number of digits of a whole id, except ids of jobs and bulk runs
 _ID = re.compile(rf"[0-9a-f]{{{FEWEST_DIGITS},{DIGITS}}}")
 _DIGITS = f"{FEWEST_DIGITS} or more hexadecimal digits"
@@ -68,21 +69,26 @@ class _Id(click.ParamType):
 
 
 def server_option(what: str, *, or_local: bool = False) -> Callable[[Command], Command]:
-    """The options ``--server`` and ``--key`` of a command that can send a request to a service; or_local: and ``--local``."""
+    """The options ``--server`` and ``--key`` of a command that can send a request to a service; or_local: and ``--local``.
+
+    The command does not get their values: `connection`, `remote` and `is_local` find them in the context.
+    """
     key = click.option(
         "--key",
         envvar="HELIOPSF_KEY",
-        expose_value=False,
-        callback=lambda context, _, key: context.meta.update({_KEY: key}),
+        **kept(_KEY),
         help="Access key. Other users can read command lines, so set HELIOPSF_KEY instead",
     )
     server = click.option(
         "--server",
         metavar="ADDRESS",
         envvar="HELIOPSF_SERVER",
+        **kept(CHOSEN_SERVER),
         help=f"{what} [default: {DEFAULT_SERVER}]{'; --local needs none' if or_local else ''}",
     )
-    local = click.option("--local", is_flag=True, help="Run in this process, without a service")
+    local = click.option(
+        "--local", is_flag=True, **kept(LOCAL), help="Run in this process, without a service"
+    )
     return lambda command: server(key(local(command) if or_local else command))
 
 
@@ -118,12 +124,13 @@ def short(identity: str) -> str:
     return identity[:SHOWN_DIGITS]
 
 
-def remote(server: str | None) -> Client:
-    """A client of the service at ``server``. The client uses the key from the option ``--key`` or from HELIOPSF_KEY,
-    if a key is given."""
+def remote() -> Client:
+    """A client of the service that ``--server`` or HELIOPSF_SERVER names, with the key of ``--key`` or HELIOPSF_KEY, if one is
+    given."""
     from service.client.http import Client
 
-    return Client(server, key=click.get_current_context().meta.get(_KEY), say=say)
+    options = click.get_current_context().meta
+    return Client(options.get(CHOSEN_SERVER), key=options.get(_KEY), say=say)
 
 
 def on_service(command: Command) -> Command:
@@ -131,8 +138,8 @@ def on_service(command: Command) -> Command:
 
     @SERVER
     @wraps(command)
-    def connected(server: str | None, **given: Any) -> Any:
-        with user_errors(), remote(server) as service:
+    def connected(**given: Any) -> Any:
+        with user_errors(), remote() as service:
             return command(service=service, **given)
 
     return connected  # type: ignore[return-value]
@@ -145,10 +152,10 @@ def print_rows(rows: Iterable[Row], line: Callable[[Row], str], *, if_none: str)
 
 
 @contextmanager
-def connection(server: str | None, local: bool, *, gap_effects: str = "") -> Iterator[Operations]:
-    """A service over HTTP, or with ``local`` this process. gap_effects: further effects for a local diagnosis."""
-    if not local:
-        with remote(server) as service:
+def connection(*, gap_effects: str = "") -> Iterator[Operations]:
+    """A service over HTTP, or with ``--local`` this process. gap_effects: further effects for a local diagnosis."""
+    if not is_local():
+        with remote() as service:
             service.health()
             yield service
         return
@@ -174,12 +181,12 @@ def whole_id(service: Operations, things: str, identity: str) -> str:
 
 
 @contextmanager
-def psf_file(server: str | None, psf: str) -> Iterator[Path]:
+def psf_file(psf: str) -> Iterator[Path]:
     """The file of the PSF that the user named. If the user named an id, the file is downloaded to a temporary folder."""
     if not is_psf_id(psf):
         yield Path(psf)
         return
-    with TemporaryDirectory(prefix="heliopsf-") as folder, remote(server) as service:
+    with TemporaryDirectory(prefix="heliopsf-") as folder, remote() as service:
         file = Path(folder) / "psf.fits"
         service.download(f"/v1/psfs/{psf}/file", file)
         yield file

@@ -23,6 +23,7 @@ from service.cli.options import (
     Place,
     counted,
     fits_files,
+    is_local,
     limits,
     methods_help,
     options_of,
@@ -80,8 +81,6 @@ def deconvolve(
     plot: Path | None,
     changes: Path | None,
     timings: bool,
-    server: str | None,
-    local: bool,
     overwrite: bool,
     **parameters: Any,
 ) -> None:
@@ -92,7 +91,7 @@ def deconvolve(
     files = fits_files(images)
     if not files:
         raise click.UsageError("expected FITS files; the folders that you named contain none")
-    if timings and not local:
+    if timings and not is_local():
         raise click.UsageError(
             "--timings: expected --local, because a service measures the stages of all jobs together; see its /metrics"
         )
@@ -109,7 +108,7 @@ def deconvolve(
             check_outputs((output.path, plot, changes), inputs=[*files, *psf_files], overwrite=overwrite)
     with (
         user_errors(),
-        connection(server, local) as service,
+        connection() as service,
         progress_bar() as report,
     ):
         parameters |= {"psf_id": named_psf(service, psf), "overwrite": overwrite}
@@ -202,8 +201,6 @@ def changes(
     output: Path,
     psf: str | None,
     most: int,
-    server: str | None,
-    local: bool,
     overwrite: bool,
     **parameters: Any,
 ) -> None:
@@ -223,7 +220,7 @@ def changes(
         if output.is_dir():
             psf_file = psf if psf and Path(psf).is_file() else None
             check_outputs((table_file, sheet_file), inputs=(*files, psf_file), overwrite=overwrite)
-    with user_errors(), connection(server, local) as service, progress_bar() as report:
+    with user_errors(), connection() as service, progress_bar() as report:
         parameters["psf_id"] = named_psf(service, psf)
         products: dict[str, dict[str, Any]] = {}
         treated, failures = treat_many(

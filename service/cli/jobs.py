@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from service.cli.connection import ID, Row, id_argument, on_service, print_rows, short, whole_id
+from service.cli.connection import (
+    CHOSEN_SERVER,
+    ID,
+    Row,
+    id_argument,
+    on_service,
+    print_rows,
+    short,
+    whole_id,
+)
 from service.cli.options import (
     JSON,
     OUTPUT,
@@ -198,7 +207,7 @@ def _state(row: Row) -> str:
         name, way = RESULTS[things]
         if row["result_deleted"]:
             return f"{name} {short(identity)} was deleted; the same request makes it again"
-        server = click.get_current_context().params["server"]
+        server = click.get_current_context().meta[CHOSEN_SERVER]
         at = "" if server is None else f" --server {server}"
         return f"{name} {short(identity)}: {way.format(id=short(identity), at=at)}"
     if row["phase"] != Phase.EXECUTING:

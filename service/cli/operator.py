@@ -30,7 +30,7 @@ from workers.files.collection import collect, examine
 from workers.files.modes import keep_private, private_folder
 from workers.files.store import open_store
 from workers.intake.again import repair
-from workers.intake.uploads import uploaded_psf_row
+from workers.intake.uploads import Upload, uploaded_psf_row
 from workers.texts import check_line
 from workers.versions import TOTAL
 
@@ -257,7 +257,8 @@ def store_psf_get(
                 with user_errors(), store.temporary() as copy:
                     shutil.copyfile(file, copy)
                     summary, sha256 = read_summary(copy, settings.psf_limits), sha256_of(copy)
-                    row = uploaded_psf_row(owner, sha256, copy.stat().st_size, file.name, summary, kind=TOTAL)
+                    upload = Upload(owner, sha256, copy.stat().st_size, file.name)
+                    row = uploaded_psf_row(upload, summary, kind=TOTAL)
                     with store.kept_if(copy, sha256):
                         row, new = catalogue.add(row)
                 echo(f"  {row.id}  {owner}: {'added' if new else 'was there'}")

@@ -245,6 +245,7 @@ NOISE = click.option(
 SATURATION = options_of(Deconvolve, "saturation_dn")
 CENTRE = click.option(
     "--centre",
+    "centre_xy",
     nargs=2,
     type=float,
     metavar="X Y",
@@ -264,17 +265,32 @@ OVERWRITE = click.option("--overwrite", is_flag=True, help="Replace output files
 NO_KEY = "this service needs a key: set HELIOPSF_KEY to your key (the operator makes keys with `heliopsf key create`)"
 
 
+LOCAL = "heliopsf.local"
+
+
+def kept(name: str) -> dict[str, Any]:
+    """The arguments of an option whose value goes to the context of the command, under this name, and not to the command."""
+    return {
+        "expose_value": False,
+        "callback": lambda context, _, value: context.meta.update({name: value}),
+    }
+
+
+def is_local() -> bool:
+    """Whether the command has the option ``--local``."""
+    context = click.get_current_context(silent=True)
+    return context is not None and bool(context.meta.get(LOCAL))
+
+
 @contextmanager
 def user_errors() -> Iterator[None]:
     """Turn an error of the user's data, files or service into text and an exit status, without a traceback."""
-    context = click.get_current_context(silent=True)
-    local = context is not None and bool(context.params.get("local"))
     try:
         yield
     except (DataError, ServiceError) as error:
         message = error.message if isinstance(error, DataError) else str(error)
         message = NO_KEY if error.code == "no-key" else message
-        raise click.ClickException("\n".join(error_lines(message, error.fields, local=local))) from error
+        raise click.ClickException("\n".join(error_lines(message, error.fields, local=is_local()))) from error
     except OSError as error:
         raise click.ClickException(str(error)) from error
 

@@ -5,8 +5,9 @@ A command imports numerical libraries only when it is called, so that other comm
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -38,7 +39,9 @@ def simulate() -> None:
 
 @simulate.command(short_help="Write a simulated transit.")
 @click.option("-o", "--output", required=True, type=OUTPUT_FOLDER, help="Folder to write to")
-@click.option("--size", default=512, type=click.IntRange(64, 4096), help="Width and height of an image, px")
+@click.option(
+    "--size", "size_px", default=512, type=click.IntRange(64, 4096), help="Width and height of an image, px"
+)
 @click.option("--images", default=30, type=click.IntRange(1, 1000), help="Number of images")
 @click.option("--seed", default=1, type=click.IntRange(0), help="Seed of scenes and noise")
 @click.option("--total", default=0.411, help="Fraction of light that is scattered, 0 to 1")
@@ -47,6 +50,7 @@ def simulate() -> None:
 @click.option("--stretch", default=0.0, help="Stretch of the scatter kernel along --stretch-angle")
 @click.option(
     "--stretch-angle",
+    "angle_deg",
     default=0.0,
     help="Direction of stretch and dipole, degrees from +x towards +y",
 )
@@ -59,11 +63,12 @@ def simulate() -> None:
 )
 @click.option(
     "--saturation",
+    "saturation_dn",
     type=float,
     metavar="DN",
     help="Clip high-gain images at this level [default: no clipping]",
 )
-@click.option("--dark-offset", default=0.0, help="Offset to add to every pixel, DN")
+@click.option("--dark-offset", "dark_offset_dn", default=0.0, help="Offset to add to every pixel, DN")
 @click.option(
     "--instrument",
     default="hri_euv",
@@ -88,23 +93,13 @@ def simulate() -> None:
 @click.option("--overwrite", is_flag=True, help="Write even if the folder is not empty; replace its files")
 def transit(
     output: Path,
-    size: int,
-    images: int,
     seed: int,
-    total: float,
-    b_px: float,
-    c: float,
-    stretch: float,
-    stretch_angle: float,
-    dipole: float,
-    beyond: str,
-    saturation: float | None,
-    dark_offset: float,
     instrument: str,
     diffraction: Path | None,
     diffraction_size: int | None,
     scene_files: tuple[Path, ...],
     overwrite: bool,
+    **parameters: Any,
 ) -> None:
     """Write a simulated transit, with its true PSF and scenes, to a folder."""
     from psfcore.instruments.model import load_instrument
@@ -117,9 +112,9 @@ def transit(
     given = [*scene_files, *(Path(one) for one in (diffraction, instrument) if one and Path(one).is_file())]
     check_fresh_folder(output, given, overwrite=overwrite)
     with user_errors():
-        scatter = ScatterTruth(b_px, c, total, stretch, stretch_angle, dipole)
-        plan = default_plan(images, size, beyond=beyond, saturation_dn=saturation, dark_offset_dn=dark_offset)
-        edge = diffraction_size or min(2 * size, LARGEST_DIFFRACTION_PX)
+        scatter = ScatterTruth(**{one.name: parameters.pop(one.name) for one in fields(ScatterTruth)})
+        plan = default_plan(**parameters)
+        edge = diffraction_size or min(2 * plan.size_px, LARGEST_DIFFRACTION_PX)
         known = diffraction_kernel(instrument, diffraction, edge, limits(), threads=THREADS)
         scenes = scenes_from_files(scene_files, plan, limits())
         of_instrument = imitated(load_instrument(instrument))
@@ -130,11 +125,11 @@ def transit(
             raise click.ClickException(f"cannot write {output}: {error.strerror or error}") from error
     exposures = sorted({shot.exposure_s for shot in plan.shots})
     echo(
-        f"{output}: {counted(images, 'image')} of {size} x {size} px, {counted(len(plan.pointings), 'pointing')}, "
+        f"{output}: {counted(len(plan.shots), 'image')} of {plan.size_px} x {plan.size_px} px, {counted(len(plan.pointings), 'pointing')}, "
         f"exposure{'s' if len(exposures) > 1 else ''} of {listed([f'{t:g}' for t in exposures])} s"
     )
     echo(
-        f"scatter b {b_px:g} px, c {c:g}, total {total:g}; the file of true values is {output / 'truth.json'}"
+        f"scatter b {scatter.b_px:g} px, c {scatter.c:g}, total {scatter.total:g}; the file of true values is {output / 'truth.json'}"
     )
 
 

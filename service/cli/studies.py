@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -99,7 +100,7 @@ def fresnel(
 def arms(
     image: Path,
     background: Path | None,
-    centre: tuple[float, float] | None,
+    centre_xy: tuple[float, float] | None,
     n_arms: int,
     saturation_dn: float | None,
     json_file: Path | None,
@@ -121,7 +122,7 @@ def arms(
             before = read_observation(background, limits(), saturation_dn=saturation_dn)
             reference = np.where(before.valid, before.pixels, np.nan)
         measured = measure_arms(
-            flare.pixels, centre, reference=reference, saturated=~flare.valid, n_arms=n_arms
+            flare.pixels, centre_xy, reference=reference, saturated=~flare.valid, n_arms=n_arms
         )
         draw = partial(arms_png, flare.pixels, measured, unit=unit_label(flare))
         write_file(plot, draw, overwrite=overwrite)
@@ -208,15 +209,12 @@ def flare(
     image: Path,
     background: Path,
     psf: str,
-    centre: tuple[float, float] | None,
-    arm_deg: float | None,
-    distances_px: tuple[float, float],
     noise: tuple[float, float] | None,
     saturation_dn: float | None,
     json_file: Path | None,
     plot: Path | None,
-    server: str | None,
     overwrite: bool,
+    **along: Any,
 ) -> None:
     """Simulate the stray light of the flare in IMAGE with a PSF, and compare it along a diffraction arm."""
     from psfcore.fits.observation import read_observation
@@ -226,15 +224,13 @@ def flare(
     from psfcore.noise import Noise
 
     with user_errors():
-        with psf_file(server, psf) as file:
+        with psf_file(psf) as file:
             tested = read_psf(file, psf_limits())
         found = judge_on_flare(
             read_observation(image, limits(), saturation_dn=saturation_dn),
             read_observation(background, limits(), saturation_dn=saturation_dn),
             tested,
-            centre_xy=None if centre is None else (round(centre[0]), round(centre[1])),
-            arm_deg=arm_deg,
-            distances_px=distances_px,
+            **along,
             noise=None if noise is None else Noise(*noise),
         )
         draw = partial(flare_png, found.difference, found.usable, found.comparison, unit=found.unit)

@@ -26,6 +26,7 @@ from service.cli.options import (
     OUTPUT_FOLDER,
     PLOT,
     SEED,
+    is_local,
     limits,
     options_of,
     progress_bar,
@@ -54,7 +55,7 @@ BOUND = (sys.executable, "-P", "-m", "psfcore.gap.bound")
 
 @contextmanager
 def _reporting(
-    server: str | None, local: bool, json_file: Path | None, *, gap_effects: str = ""
+    json_file: Path | None, *, gap_effects: str = ""
 ) -> Iterator[tuple[Operations, Path, Progress]]:
     """A service, the file for the numbers of its report, and the function that shows its progress.
 
@@ -63,7 +64,7 @@ def _reporting(
     with (
         user_errors(),
         TemporaryDirectory(prefix="heliopsf-") as folder,
-        connection(server, local, gap_effects=gap_effects) as service,
+        connection(gap_effects=gap_effects) as service,
         progress_bar() as say,
     ):
         yield service, json_file or Path(folder) / "report.json", say
@@ -84,9 +85,6 @@ def report(
     json_file: Path | None,
     plot: Path | None,
     psf: str | None,
-    server: str | None,
-    local: bool,
-    overwrite: bool,
     **parameters: Any,
 ) -> None:
     """Fit a PSF to TRANSIT, or test a PSF on it: compare simulated and observed light in the occulter's disc.
@@ -102,7 +100,7 @@ def report(
         raise click.UsageError(
             "--shapes fits every shape to TRANSIT, so it cannot be used with --psf: remove one of the two"
         )
-    with _reporting(server, local, json_file) as (service, numbers, say):
+    with _reporting(json_file) as (service, numbers, say):
         found = service.report(
             transit,
             numbers,
@@ -110,7 +108,6 @@ def report(
             preview=plot,
             progress=say,
             psf_id=named_psf(service, psf),
-            overwrite=overwrite,
             **parameters,
         )
         told = json.loads(numbers.read_text("utf-8"))
@@ -177,8 +174,6 @@ def diagnose(
     psf: str | None,
     corrected_file: Path | None,
     effects: str | None,
-    server: str | None,
-    local: bool,
     overwrite: bool,
     **parameters: Any,
 ) -> None:
@@ -186,11 +181,11 @@ def diagnose(
 
     TRANSIT is a folder with a transit.json, or a .zip or .tar file of such a folder.
     """
-    if effects is not None and not local:
+    if effects is not None and not is_local():
         raise click.UsageError(
             "--effects: expected --local with it; a service tests the effects in HELIOPSF_GAP_EFFECTS"
         )
-    with _reporting(server, local, json_file, gap_effects=effects or "") as (service, numbers, say):
+    with _reporting(json_file, gap_effects=effects or "") as (service, numbers, say):
         found = service.diagnose_gap(
             transit,
             numbers,
@@ -199,7 +194,7 @@ def diagnose(
             progress=say,
             psf_id=named_psf(service, psf),
             # A service always makes the corrected PSF and keeps it, so that later requests find it.
-            correct=corrected_file is not None or not local,
+            correct=corrected_file is not None or not is_local(),
             overwrite=overwrite,
             **parameters,
         )
@@ -211,7 +206,7 @@ def diagnose(
     files = [output, json_file, plot, corrected_file if corrected else None]
     if any(files):
         echo(f"written: {', '.join(str(path) for path in files if path is not None)}")
-    step = _next_step(report, f"{transit}{' --local' if local else ''}", output, corrected_file)
+    step = _next_step(report, f"{transit}{' --local' if is_local() else ''}", output, corrected_file)
     if step:
         echo(f"next: {step}")
     if corrected_file is not None and corrected is None:
@@ -248,7 +243,7 @@ def _lines(report: dict[str, Any]) -> list[str]:
 @click.option("--cases", default=24, type=click.IntRange(1, 9999), help="Number of cases")
 @click.option("--seed", default=1, type=click.IntRange(0), help="Seed of random numbers")
 @click.option("-o", "--output", required=True, type=OUTPUT_FOLDER, help="Folder of the set")
-@click.option("--size", default=256, type=click.IntRange(128, 1024), help="Width and height, px")
+@click.option("--size", "size_px", default=256, type=click.IntRange(128, 1024), help="Width and height, px")
 @click.option("--images", default=18, type=click.IntRange(6, 200), help="Images per transit")
 @click.option(
     "--processes",
@@ -271,26 +266,16 @@ def _lines(report: dict[str, Any]) -> list[str]:
 @click.option("--clean-only", is_flag=True, help="Make only cases without an effect, to count false alarms")
 @click.option(
     "--synthetic",
+    "built_diffraction",
     is_flag=True,
+    callback=lambda context, parameter, synthetic: not synthetic,
     help="Use a synthetic diffraction PSF, which is made faster than the PSF of the instrument",
 )
 @click.option(
     "--make-only", is_flag=True, help="Make and seal the cases and keep the transits, but diagnose nothing"
 )
 def blind(
-    cases: int,
-    seed: int,
-    output: Path,
-    size: int,
-    images: int,
-    processes: int,
-    keep: bool,
-    scenes: tuple[Path, ...],
-    only: tuple[str, ...],
-    left_pct: tuple[float, ...],
-    clean_only: bool,
-    synthetic: bool,
-    make_only: bool,
+    output: Path, processes: int, keep: bool, scenes: tuple[Path, ...], make_only: bool, **parameters: Any
 ) -> None:
     """Test the diagnosis on simulated cases whose effect is withheld from the diagnosis. To continue a stopped run,
     repeat the command."""
@@ -303,20 +288,20 @@ def blind(
     def say(line: str) -> None:
         echo(line, err=True)
 
-    if clean_only and only:
+    plan = SetPlan(**parameters)
+    if plan.clean_only and plan.only:
         raise click.UsageError("expected one of --clean-only and --only; got both")
     with user_errors(), alone_in(output):
-        plan = SetPlan(cases, seed, size, images, only, clean_only, not synthetic, left_pct)
         planes = [image_rate(file, limits()) for file in scenes]
         blind_set, not_made = make_set(output, plan, scenes=planes, processes=processes, progress=say)
-        numbers = [number for number in range(cases) if number not in not_made]
+        numbers = [number for number in range(plan.cases) if number not in not_made]
         if not numbers:
             why = next(iter(not_made.values()))
             raise DataError(
-                "no-case-made", f"none of the {cases} cases could be made; the first failed with: {why}"
+                "no-case-made", f"none of the {plan.cases} cases could be made; the first failed with: {why}"
             )
         if make_only:
-            echo(f"{output}: {len(numbers)} of {cases} cases made and sealed")
+            echo(f"{output}: {len(numbers)} of {plan.cases} cases made and sealed")
             return
         run_set(blind_set, numbers, DIAGNOSE, bound=BOUND, processes=processes, keep=keep, progress=say)
         echo(write_score(blind_set, numbers, not_made))

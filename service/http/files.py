@@ -35,7 +35,7 @@ from service.http.state import State, state_of
 from workers.catalogue.catalogue import Row
 from workers.catalogue.tables import ImageRow, PsfRow, TransitRow
 from workers.files.store import BadFile, Store, lost
-from workers.intake.uploads import image_row, transit_row, uploaded_psf_row
+from workers.intake.uploads import Upload, image_row, transit_row, uploaded_psf_row
 
 log = logging.getLogger(__name__)
 
@@ -293,9 +293,9 @@ async def add_upload(
         summary = await state.pixels.run(caller.owner, kind.inspect, path, state)
         there = None if equal is None else await run_in_threadpool(equal, file.sha256)
         if there is None:
-            about = (caller.owner, file.sha256, file.bytes, label(file.filename))
-            upload = kind.row(*about, summary, **(columns or {}))
-            row, new = await state.stored.run(caller.owner, allowed.keep, path, file.sha256, upload)
+            upload = Upload(caller.owner, file.sha256, file.bytes, label(file.filename))
+            row = kind.row(upload, summary, **(columns or {}))
+            row, new = await state.stored.run(caller.owner, allowed.keep, path, file.sha256, row)
         else:
             row, new = there, False
     response.status_code = 201 if new else 200

@@ -48,7 +48,7 @@ from workers.catalogue.tables import ImageRow, JobRow, ProductRow, PsfRow, Repor
 from workers.contract.requests import Identity
 from workers.intake.compatibility import DEPRECATED_CODE, deprecation, suits
 from workers.intake.psf_choice import ChosenPsf
-from workers.intake.uploads import image_row
+from workers.intake.uploads import Upload, image_row
 from workers.versions import PsfStatus
 
 SAMPLE = "sample.fits"
@@ -115,9 +115,8 @@ def _add_sample(state: State, caller: Caller) -> ImageRow:
         copy = Path(shutil.copy(shipped, folder))  # the store moves the file that it gets
         digest = hashlib.sha256(copy.read_bytes()).hexdigest()
         summary = read_summary(copy, state.limits)
-        row, _ = take.keep(
-            copy, digest, image_row(caller.owner, digest, copy.stat().st_size, SAMPLE, summary)
-        )
+        upload = Upload(caller.owner, digest, copy.stat().st_size, SAMPLE)
+        row, _ = take.keep(copy, digest, image_row(upload, summary))
     return row
 
 

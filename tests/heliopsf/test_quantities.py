@@ -53,6 +53,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"threads": "two"}, "bad-threads"),
     ({"method": "richardson_lucy"}, "unknown-method"),
     ({"order": 2}, "unknown-parameter"),
+    ({"regoin": "0:32,0:32"}, "unknown-parameter"),
     ({"psf": "no.fits"}, "no-such-file"),
     ({"psf": {"kernel": 1}}, "bad-input"),
     ({"smap": "no.fits"}, "no-such-file"),

@@ -207,13 +207,13 @@ from psfcore.convolution import fft_kernels
 plan = fft_kernels.make_plan(192)
 x = np.zeros((192, 2, 16), np.float32)
 x[0, 0] = 1
-fft_kernels.forward(x.reshape(-1), *plan.numbers)
+fft_kernels.forward(x.reshape(-1), plan)
 assert (x[:, 0] == 1).all() and (x[:, 1] == 0).all()
 passes = fft_kernels._FORWARD[8], fft_kernels._FORWARD[3], fft_kernels._INVERSE[8]
 print(*(kernel._kernel.cache_hits for kernel in passes), sum(fft_kernels.forward.stats.cache_hits.values()))
 print(prepared := "numba.np.linalg" in sys.modules)
 if not prepared:
-    fft_kernels.inverse(x.reshape(-1), *plan.numbers)
+    fft_kernels.inverse(x.reshape(-1), plan)
     assert np.allclose(x[0, 0] / 192, 1, rtol=1e-6) and np.allclose(x[1:], 0, atol=1e-4)
     assert not fft_kernels.inverse.stats.cache_hits, "this process compiles it"
 """

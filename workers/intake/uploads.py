@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from typing import Any
+from typing import Any, NamedTuple
 
 from psfcore.fits.header import HeaderSummary
 from psfcore.transit.archive import ArchiveContents
@@ -14,31 +14,36 @@ from workers.versions import UPLOADED, PsfStatus, channel_of, instrument_of, lab
 TEXT_LENGTH = 200
 
 
-def image_row(
-    owner: str, sha256: str, size_bytes: int, filename: str | None, summary: HeaderSummary
-) -> ImageRow:
+class Upload(NamedTuple):
+    """A file that an owner sent. filename: the name that the client gave to it, if any."""
+
+    owner: str
+    sha256: str
+    size_bytes: int
+    filename: str | None
+
+
+def image_row(upload: Upload, summary: HeaderSummary) -> ImageRow:
     """The row of an uploaded image."""
     return ImageRow(
-        owner=owner,
-        id=sha256,
+        owner=upload.owner,
+        id=upload.sha256,
         created_at=time.time(),
-        bytes=size_bytes,
-        filename=filename,
+        bytes=upload.size_bytes,
+        filename=upload.filename,
         summary=_summary(summary),
     )
 
 
-def transit_row(
-    owner: str, sha256: str, size_bytes: int, filename: str | None, contents: ArchiveContents
-) -> TransitRow:
+def transit_row(upload: Upload, contents: ArchiveContents) -> TransitRow:
     """The row of an uploaded transit. Its summary comes from the archive's table of contents and transit.json."""
     manifest = contents.manifest
     return TransitRow(
-        owner=owner,
-        id=sha256,
+        owner=upload.owner,
+        id=upload.sha256,
         created_at=time.time(),
-        bytes=size_bytes,
-        filename=filename,
+        bytes=upload.size_bytes,
+        filename=upload.filename,
         summary={
             "archive": contents.kind,
             "instrument": manifest.instrument,
@@ -54,10 +59,7 @@ def transit_row(
 
 
 def uploaded_psf_row(
-    owner: str,
-    sha256: str,
-    size_bytes: int,
-    filename: str | None,
+    upload: Upload,
     summary: HeaderSummary,
     *,
     name: str | None = None,
@@ -75,10 +77,10 @@ def uploaded_psf_row(
     instrument = instrument or instrument_of(header)
     channel = channel or channel_of(instrument, summary.wavelnth)
     kind = kind or UPLOADED
-    named = name_of_upload(summary, filename, sha256)
+    named = name_of_upload(summary, upload.filename, upload.sha256)
     return PsfRow(
-        owner=owner,
-        id=sha256,
+        owner=upload.owner,
+        id=upload.sha256,
         created_at=time.time(),
         name=name or named[0],
         version=version or named[1],
@@ -88,14 +90,14 @@ def uploaded_psf_row(
         series=series_of(instrument, channel, kind),
         status=PsfStatus.DRAFT,
         origin="uploaded",
-        file_sha256=sha256,
-        bytes=size_bytes,
+        file_sha256=upload.sha256,
+        bytes=upload.size_bytes,
         preview_sha256=None,
         details={
             "shape": list(summary.shape),
             "plate_scale_arcsec": summary.cdelt1,
             "wavelength_angstrom": summary.wavelnth,
-            "filename": filename,
+            "filename": upload.filename,
             "cards": header["cards"],
         },
     )

@@ -47,12 +47,11 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from psfcore.convolution.engine import Engine
-from psfcore.deconvolve.conditions import Progress
+from psfcore.deconvolve.conditions import Conditions, Progress
 from psfcore.deconvolve.edges import inside_band
 from psfcore.errors import DataError
 from psfcore.fits.units import dn_per_unit
 from psfcore.image import Image
-from psfcore.noise import Noise
 from psfcore.psf import Psf
 
 WINDOW_PX = 2.0
@@ -83,25 +82,25 @@ def error_planes(
     image: Image,
     psf: Psf,
     run: Callable[[Image], Plane],
-    noise: Noise,
+    conditions: Conditions,
     *,
     estimate: Plane,
     draws: int,
     seed: int = 0,
     edge_px: int = 0,
-    threads: int = 1,
-    progress: Progress | None = None,
 ) -> ErrorPlanes:
     """Compute the error plane of `run(image)`. `run` deconvolves an image of this shape and mask with any method.
 
-    estimate: run(image). draws: number of noise realisations. edge_px: width of the band at the
-    edges that is left out of the amplification. The same seed gives the same planes. progress(done, of) is called after
-    each run; its exceptions are not caught. Raises DataError "bad-draws", "no-exposure".
+    conditions: with the noise of the camera, and the threads; progress(done, of) is called after each run, and its exceptions are
+    not caught. estimate: run(image). draws: number of noise realisations, 2 or more. edge_px: width of the band at the edges
+    that is left out of the amplification. The same seed gives the same planes. Raises DataError "bad-draws", "no-exposure".
     """
     if draws < SMALLEST_DRAWS:
         raise DataError("bad-draws", f"expected at least {SMALLEST_DRAWS} noise realisations; got {draws}")
+    noise, progress = conditions.noise, conditions.progress
+    assert noise is not None
     scale = dn_per_unit(image)
-    expected = expected_image(image, estimate, psf, threads=threads)
+    expected = expected_image(image, estimate, psf, threads=conditions.threads)
     base = run(_with_pixels(image, expected))
     _tell(progress, 1, draws + 1)
     reference_variance = noise.variance(_local_mean(expected, image.valid, REFERENCE_WINDOW_PX), scale)

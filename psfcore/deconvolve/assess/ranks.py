@@ -120,7 +120,8 @@ def _cut(values: Values, borders: Values, lower: NDArray[np.int64], parts: Group
     bits, equal = values.view(np.int32), np.zeros(borders.size, np.int64)
     first = np.zeros(_BINS, np.uint8)  # the number of borders in lower bins
     for bit in borders.view(np.int32):
-        first[_bin(bit) + 1 :] += np.uint8(1)
+        for place in range(_bin(bit) + 1, _BINS):  # to add to a slice would compile two seconds longer
+            first[place] += 1
     for n in range(values.size):
         part = np.int64(first[_bin(bits[n])])
         while part < borders.size and borders[part] < values[n]:

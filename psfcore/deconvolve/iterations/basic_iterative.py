@@ -28,8 +28,8 @@ from dataclasses import replace
 import numpy as np
 
 from psfcore.compiled import compiled
-from psfcore.convolution.engine import buffer_from_spectrum, spectrum_from_buffer
-from psfcore.convolution.fft_kernels import LANES, forward, inverse
+from psfcore.convolution.engine import rows_from_spectrum, rows_to_spectrum
+from psfcore.convolution.fft_kernels import LANES
 from psfcore.deconvolve.conditions import Deconvolved
 from psfcore.deconvolve.iterations.linear import (
     LinearIteration,
@@ -61,10 +61,8 @@ class BasicIterative(LinearIteration):
 
     def measure(self) -> None:
         self.engine.columns(adjoint=False)
-        self.engine.row_stage(
-            _step_rows, self.observed, self.x, self._next, self.moved, self.total, *self.judgement.numbers
-        )
-        self.change = relative_change(self.moved.sum(), self.total.sum())
+        self.engine.row_stage(_step_rows, self.observed, self.x, self._next, self.changes, self.judgement)
+        self.change = relative_change(*self.changes.sum(axis=1))
 
     def update(self, *, last: bool) -> None:
         self.x, self._next = self._next, self.x
@@ -84,36 +82,32 @@ def _check_converges(sample: TransferSample, steps: int) -> None:
 
 
 @compiled(fastmath={"contract", "reassoc"})
-def _step_rows(spectrum, observed, x, new, moved, total, judged, first, last, slope, ground, sums, buffer, corner, start, stop, length, passes, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
+def _step_rows(lines, start, stop, observed, x, new, changes, judgement):  # type: ignore[no-untyped-def]
     """Compute `new` by Eq. (1) and transform its rows.
 
     Add up (change)^2 and x^2 over all pixels, and (y - H x)^2 / variance over the judged pixels.
     """
-    nx = x.shape[1]
+    nx, judged = x.shape[1], judgement.rows
     zero, least = np.float32(0.0), np.float32(1e-30)
-    z = buffer.reshape((-1, 2, LANES))
     for block in range(start, stop):
-        buffer_from_spectrum(spectrum, buffer, corner, block, length, place)
-        inverse(buffer, length, passes, lengths, tw, offsets)
-        sum_here, moved_here, total_here = 0.0, 0.0, 0.0
+        z = rows_from_spectrum(lines, block)
+        sum_here, moved, total = 0.0, 0.0, 0.0
         for i in range(nx):
             sum_row, moved_row, total_row = zero, zero, zero
             for side in range(2):
                 for w in range(LANES):
                     y, model = observed[block, i, side, w], z[i, side, w]
                     misfit = y - model if y == y else zero
-                    variance = max(slope * max(model, zero) + ground, least)
+                    variance = max(judgement.slope * max(model, zero) + judgement.ground, least)
                     sum_row += judged[block, side, w] * misfit * misfit / variance
                     value = x[block, i, side, w] + misfit  # Eq. (1)
                     new[block, i, side, w] = value
                     z[i, side, w] = value
                     moved_row += misfit * misfit
                     total_row += value * value
-            if first <= i < last:
+            if judgement.first <= i < judgement.last:
                 sum_here += sum_row
-            moved_here += moved_row
-            total_here += total_row
-        sums[block], moved[block], total[block] = sum_here, moved_here, total_here
-        buffer[nx * 2 * LANES : length * 2 * LANES] = zero
-        forward(buffer, length, passes, lengths, tw, offsets)
-        spectrum_from_buffer(spectrum, buffer, corner, block, length, place)
+            moved += moved_row
+            total += total_row
+        judgement.sums[block], changes[0, block], changes[1, block] = sum_here, moved, total
+        rows_to_spectrum(lines, block, nx)

@@ -45,13 +45,14 @@ from psfcore.convolution.engine import (
     BLOCK_ROWS,
     Engine,
     Single,
-    buffer_from_spectrum,
-    spectrum_from_buffer,
+    rows_from_spectrum,
+    rows_to_spectrum,
 )
-from psfcore.convolution.fft_kernels import LANES, forward, inverse
+from psfcore.convolution.fft_kernels import LANES
 from psfcore.deconvolve.conditions import Deconvolved
 from psfcore.deconvolve.problem import (
     Iteration,
+    Judgement,
     Problem,
     first_estimate,
     relative_change,
@@ -87,7 +88,7 @@ class LinearIteration(Iteration):
         self.x = engine.to_lanes(first_estimate(problem))
         trusted = np.where(domain.trusted, domain.pixels, np.float32(np.nan))
         self.observed = engine.to_lanes(trusted, padding=np.nan)
-        self.moved, self.total = np.zeros((2, engine.row_blocks))  # sums of (change)^2 and x^2
+        self.changes = np.zeros((2, engine.row_blocks))  # sums of (change)^2 and x^2
         engine.rows_forward(self.x)
 
 
@@ -104,12 +105,12 @@ class Additive(LinearIteration):
 
     def measure(self) -> None:
         self.engine.columns(adjoint=False)
-        self.engine.row_stage(_residual_rows, self.observed, *self.judgement.numbers, _all_rows(self.engine))
+        self.engine.row_stage(_residual_rows, self.observed, self.judgement, _all_rows(self.engine))
 
     def update(self, *, last: bool) -> None:
         self.engine.multiply_columns(self._step_filter)
-        self.engine.row_stage(_add_rows, self.x, not last, self.moved, self.total, _all_rows(self.engine))
-        self.change = relative_change(self.moved.sum(), self.total.sum())
+        self.engine.row_stage(_add_rows, self.x, not last, self.changes, _all_rows(self.engine))
+        self.change = relative_change(*self.changes.sum(axis=1))
 
 
 def _all_rows(engine: Engine) -> int:
@@ -125,14 +126,15 @@ def solve_linear(
     start: the first estimate. The scene is dark beyond the edges of the field. step_filter: as for `Additive`.
     """
     x, rows = start.copy(), engine.field_shape[0]
-    moved, total, sums = np.zeros((3, engine.row_blocks))
-    none = np.zeros((engine.row_blocks, 2, LANES), np.float32)  # no pixel is judged
+    changes, sums = np.zeros((2, engine.row_blocks)), np.zeros(engine.row_blocks)
+    rows_judged = np.zeros((engine.row_blocks, 2, LANES), np.float32)
+    nothing = Judgement(rows_judged, 0, 0, 0, np.float32(0), np.float32(1), sums)
     engine.rows_forward(x)
     for left in reversed(range(steps)):
         engine.columns(adjoint=False)
-        engine.row_stage(_residual_rows, observed, none, 0, 0, np.float32(0), np.float32(1), sums, rows)
+        engine.row_stage(_residual_rows, observed, nothing, rows)
         engine.multiply_columns(step_filter)
-        engine.row_stage(_add_rows, x, left > 0, moved, total, rows)
+        engine.row_stage(_add_rows, x, left > 0, changes, rows)
     return x
 
 
@@ -146,7 +148,7 @@ class TransferSample:
 
 def transfer_sample(engine: Engine) -> TransferSample:
     """A sample of an engine's transfer function: along y, every k-th frequency (k: first radix of its transform)."""
-    rows = engine.column_plan.length // int(engine.column_plan.radices[0])
+    rows = int(engine.column_plan.lengths[1])
     lanes = engine.transfer[:, :rows].astype(np.float64) * engine.transfer_scale
     values = lanes[:, :, 0] if engine.symmetric else lanes[:, :, 0] + 1j * lanes[:, :, 1]
     # Frequencies along x run from 0 to L / 2. Except the first and last, each also represents its negative.
@@ -169,17 +171,15 @@ def noise_amplification(
 
 
 @compiled(fastmath={"contract", "reassoc"})
-def _residual_rows(spectrum, observed, judged, first, last, slope, ground, sums, rows, buffer, corner, start, stop, length, passes, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
+def _residual_rows(lines, start, stop, observed, judgement, rows):  # type: ignore[no-untyped-def]
     """Replace H x by w (y - H x), where y is NaN if w is 0. Add up (y - H x)^2 / variance over the judged pixels.
 
     The result is 0 beyond the number of rows.
     """
-    nx = observed.shape[1]
+    nx, judged = observed.shape[1], judgement.rows
     zero, least = np.float32(0.0), np.float32(1e-30)
-    z = buffer.reshape((-1, 2, LANES))
     for block in range(start, stop):
-        buffer_from_spectrum(spectrum, buffer, corner, block, length, place)
-        inverse(buffer, length, passes, lengths, tw, offsets)
+        z = rows_from_spectrum(lines, block)
         sum_here = 0.0
         for i in range(nx):
             sum_row = zero
@@ -187,28 +187,24 @@ def _residual_rows(spectrum, observed, judged, first, last, slope, ground, sums,
                 for w in range(LANES):
                     y, model = observed[block, i, side, w], z[i, side, w]
                     misfit = y - model if y == y else zero
-                    variance = max(slope * max(model, zero) + ground, least)
+                    variance = max(judgement.slope * max(model, zero) + judgement.ground, least)
                     sum_row += judged[block, side, w] * misfit * misfit / variance
                     z[i, side, w] = misfit
-            if first <= i < last:
+            if judgement.first <= i < judgement.last:
                 sum_here += sum_row
-        sums[block] = sum_here
+        judgement.sums[block] = sum_here
         _clear_beyond(z, rows - block * 2 * LANES, nx)
-        buffer[nx * 2 * LANES : length * 2 * LANES] = zero
-        forward(buffer, length, passes, lengths, tw, offsets)
-        spectrum_from_buffer(spectrum, buffer, corner, block, length, place)
+        rows_to_spectrum(lines, block, nx)
 
 
 @compiled(fastmath={"contract", "reassoc"})
-def _add_rows(spectrum, x, again, moved, total, rows, buffer, corner, start, stop, length, passes, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
+def _add_rows(lines, start, stop, x, again, changes, rows):  # type: ignore[no-untyped-def]
     """Compute x <- x + G w (y - H x), Eq. (1). Add up (change)^2 and x^2 for each block. x is 0 beyond the number of rows."""
     nx = x.shape[1]
     zero = np.float32(0.0)
-    z = buffer.reshape((-1, 2, LANES))
     for block in range(start, stop):
-        buffer_from_spectrum(spectrum, buffer, corner, block, length, place)
-        inverse(buffer, length, passes, lengths, tw, offsets)
-        moved_here, total_here = 0.0, 0.0
+        z = rows_from_spectrum(lines, block)
+        moved, total = 0.0, 0.0
         for i in range(nx):
             moved_row, total_row = zero, zero
             for side in range(2):
@@ -219,15 +215,13 @@ def _add_rows(spectrum, x, again, moved, total, rows, buffer, corner, start, sto
                     z[i, side, w] = value
                     moved_row += change * change
                     total_row += value * value
-            moved_here += moved_row
-            total_here += total_row
-        moved[block], total[block] = moved_here, total_here
+            moved += moved_row
+            total += total_row
+        changes[0, block], changes[1, block] = moved, total
         _clear_beyond(z, rows - block * 2 * LANES, nx)
         _clear_beyond(x[block], rows - block * 2 * LANES, nx)
         if again:
-            buffer[nx * 2 * LANES : length * 2 * LANES] = zero
-            forward(buffer, length, passes, lengths, tw, offsets)
-            spectrum_from_buffer(spectrum, buffer, corner, block, length, place)
+            rows_to_spectrum(lines, block, nx)
 
 
 @compiled()

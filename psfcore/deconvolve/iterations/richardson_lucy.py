@@ -39,8 +39,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.compiled import compiled
-from psfcore.convolution.engine import buffer_from_spectrum, spectrum_from_buffer
-from psfcore.convolution.fft_kernels import LANES, forward, inverse
+from psfcore.convolution.engine import rows_from_spectrum, rows_to_spectrum
+from psfcore.convolution.fft_kernels import LANES
 from psfcore.deconvolve.problem import (
     Iteration,
     Problem,
@@ -83,7 +83,7 @@ class LucyIteration(Iteration):
 
     def measure(self) -> None:
         self.engine.columns(adjoint=False)
-        self.engine.row_stage(_ratio_rows, self._light_or_agreed, self.floor, *self.judgement.numbers)
+        self.engine.row_stage(_ratio_rows, self._light_or_agreed, self.floor, self.judgement)
 
 
 class RichardsonLucy(LucyIteration):
@@ -95,13 +95,13 @@ class RichardsonLucy(LucyIteration):
         self.x = problem.engine.to_lanes(estimate)
         del estimate  # makes room for the planes of the ratio
         super().__init__(problem, agreed(problem), brightest)
-        self._moved, self._total = np.zeros((2, problem.engine.row_blocks))
+        self._changes = np.zeros((2, problem.engine.row_blocks))
         self.engine.rows_forward(self.x)
 
     def update(self, *, last: bool) -> None:
         self.engine.columns(adjoint=True)
-        self.engine.row_stage(_update_rows, self.x, self.dark, not last, self._moved, self._total)  # Eq. (1)
-        self.change = relative_change(self._moved.sum(), self._total.sum())
+        self.engine.row_stage(_update_rows, self.x, self.dark, not last, self._changes)  # Eq. (1)
+        self.change = relative_change(*self._changes.sum(axis=1))
 
 
 def light_above_floor(problem: Problem) -> Single:
@@ -128,16 +128,13 @@ def agreed(problem: Problem) -> Single | float:
 
 
 @compiled(fastmath=_SUMS, error_model="numpy")
-def _ratio_rows(spectrum, light, floor, judged, first, last, slope, ground, sums, buffer, corner, start, stop, length, passes, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
+def _ratio_rows(lines, start, stop, light, floor, judgement):  # type: ignore[no-untyped-def]
     """Replace H x, raised to `floor` where it is smaller, by Eq. (2). Add up (y - H x)^2 / variance over the judged
     pixels."""
-    nx = light.shape[1]
-    zero = np.float32(0.0)
-    least = np.float32(1e-30)
-    z = buffer.reshape((-1, 2, LANES))
+    nx, judged = light.shape[1], judgement.rows
+    zero, least = np.float32(0.0), np.float32(1e-30)
     for block in range(start, stop):
-        buffer_from_spectrum(spectrum, buffer, corner, block, length, place)
-        inverse(buffer, length, passes, lengths, tw, offsets)
+        z = rows_from_spectrum(lines, block)
         sum_here = 0.0
         for i in range(nx):
             sum_row = zero
@@ -146,28 +143,29 @@ def _ratio_rows(spectrum, light, floor, judged, first, last, slope, ground, sums
                     y = light[block, i, side, w]
                     model = max(z[i, side, w], floor)
                     misfit = y - model
-                    part = judged[block, side, w] * misfit * misfit / max(slope * model + ground, least)
+                    part = (
+                        judged[block, side, w]
+                        * misfit
+                        * misfit
+                        / max(judgement.slope * model + judgement.ground, least)
+                    )
                     sum_row += part if y >= zero else zero
                     z[i, side, w] = y / model if y >= zero else -y
-            if first <= i < last:
+            if judgement.first <= i < judgement.last:
                 sum_here += sum_row
-        sums[block] = sum_here
-        buffer[nx * 2 * LANES : length * 2 * LANES] = zero
-        forward(buffer, length, passes, lengths, tw, offsets)
-        spectrum_from_buffer(spectrum, buffer, corner, block, length, place)
+        judgement.sums[block] = sum_here
+        rows_to_spectrum(lines, block, nx)
 
 
 @compiled(fastmath=_SUMS, error_model="numpy")
-def _update_rows(spectrum, estimate, dark, again, moved, total, buffer, corner, start, stop, length, passes, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
+def _update_rows(lines, start, stop, estimate, dark, again, changes):  # type: ignore[no-untyped-def]
     """Compute x <- x * correction, Eq. (1). Set values below `dark` to 0. Add up (change)^2 and x^2 for each block."""
     used = estimate.shape[1] * 2 * LANES
-    zero = np.float32(0.0)
+    zero, buffer = np.float32(0.0), lines.buffer
     for block in range(start, stop):
-        buffer_from_spectrum(spectrum, buffer, corner, block, length, place)
-        inverse(buffer, length, passes, lengths, tw, offsets)
+        rows_from_spectrum(lines, block)
         whole = estimate[block].reshape(-1)
-        moved_here = 0.0
-        total_here = 0.0
+        moved, total = 0.0, 0.0
         # The sums of short parts are in single precision, so that the compiler can use vector instructions.
         for first in range(0, used, _SUMMED):
             moved_part = zero
@@ -182,11 +180,8 @@ def _update_rows(spectrum, estimate, dark, again, moved, total, buffer, corner, 
                 z[n] = new
                 moved_part += (new - old) * (new - old)
                 total_part += new * new
-            moved_here += moved_part
-            total_here += total_part
-        moved[block] = moved_here
-        total[block] = total_here
+            moved += moved_part
+            total += total_part
+        changes[0, block], changes[1, block] = moved, total
         if again:
-            buffer[used : length * 2 * LANES] = zero
-            forward(buffer, length, passes, lengths, tw, offsets)
-            spectrum_from_buffer(spectrum, buffer, corner, block, length, place)
+            rows_to_spectrum(lines, block, estimate.shape[1])

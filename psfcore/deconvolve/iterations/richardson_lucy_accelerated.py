@@ -55,11 +55,10 @@ class Accelerated(LucyIteration):
         """Compute Eq. (2); the new estimate replaces the oldest one. Returns a_k of Eq. (3)."""
         new, before = self._earlier, self._before
         sums = np.zeros((self.engine.row_blocks, 4))
-
-        def work(first: int, end: int, _: object) -> None:
-            _correct(new, self.x, self._corrected, self._x, self._gradient, self.dark, sums, first, end)
-
-        self.engine.run(work, self.engine.row_blocks)
+        planes = new, self.x, self._corrected, self._x, self._gradient
+        self.engine.run(
+            lambda start, stop, _: _correct(planes, self.dark, sums, start, stop), self.engine.row_blocks
+        )
         self._before, self._x = self._x, new
         self._earlier = before if self._order == 2 else self._before
         alike, length, moved, total = sums.sum(axis=0)
@@ -70,16 +69,20 @@ class Accelerated(LucyIteration):
         """Compute the prediction of Eq. (1)."""
         a = np.float32(acceleration)
         curvature = np.float32(acceleration**2 / 2 if self._order == 2 else 0)
-
-        def work(first: int, end: int, _: object) -> None:
-            _predict(self.x, self._x, self._before, self._earlier, a, curvature, self.dark, first, end)
-
-        self.engine.run(work, self.engine.row_blocks)
+        planes = self.x, self._x, self._before, self._earlier
+        self.engine.run(
+            lambda start, stop, _: _predict(planes, a, curvature, self.dark, start, stop),
+            self.engine.row_blocks,
+        )
 
 
 @compiled(fastmath={"contract", "reassoc"})
-def _correct(new, prediction, correction, x, gradient, dark, sums, start, stop):  # type: ignore[no-untyped-def]
-    """Compute new <- prediction * correction and gradient <- new - prediction, and the sums for Eq. (3) and the change."""
+def _correct(planes, dark, sums, start, stop):  # type: ignore[no-untyped-def]
+    """Compute new <- prediction * correction and gradient <- new - prediction, and the sums for Eq. (3) and the change.
+
+    planes: new, prediction, correction, x, gradient.
+    """
+    new, prediction, correction, x, gradient = planes
     zero = np.float32(0.0)
     for block in range(start, stop):
         n, p, c = new[block].reshape(-1), prediction[block].reshape(-1), correction[block].reshape(-1)
@@ -98,8 +101,12 @@ def _correct(new, prediction, correction, x, gradient, dark, sums, start, stop):
 
 
 @compiled(fastmath={"contract"})
-def _predict(prediction, x, before, earlier, a, curvature, dark, start, stop):  # type: ignore[no-untyped-def]
-    """Compute the prediction of Eq. (1). Where x is above 0, the prediction is kept above 0."""
+def _predict(planes, a, curvature, dark, start, stop):  # type: ignore[no-untyped-def]
+    """Compute the prediction of Eq. (1). Where x is above 0, the prediction is kept above 0.
+
+    planes: prediction, x, and x one and two steps before.
+    """
+    prediction, x, before, earlier = planes
     two = np.float32(2.0)
     for block in range(start, stop):
         p, new = prediction[block].reshape(-1), x[block].reshape(-1)

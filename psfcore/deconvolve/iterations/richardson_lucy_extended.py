@@ -52,8 +52,7 @@ class Extended(LucyIteration):
         parts = self.engine.run(
             lambda first, end, _: self._step(slice(first, end), last), self.engine.row_blocks
         )
-        moved, total = np.sum(parts, axis=0)
-        self.change = relative_change(moved, total)
+        self.change = relative_change(*np.sum(parts, axis=0))
         if not last:
             self.engine.rows_forward(self.x)
 

@@ -51,16 +51,15 @@ class TotalVariation(LucyIteration):
         self.engine.rows_inverse(self._lanes)
         correction = self.engine.from_lanes(self._lanes)
         sums = np.zeros((self.x.shape[0], 2))
-
-        def work(start: int, stop: int, _: object) -> None:
-            _smooth_rows(
-                self.x, correction, self._new, self._smoothing, self._softening, self.dark, sums, start, stop
-            )
-
-        self.engine.run(work, self.x.shape[0])
+        planes = self.x, correction, self._new
+        self.engine.run(
+            lambda start, stop, _: _smooth_rows(
+                planes, self._smoothing, self._softening, self.dark, sums, start, stop
+            ),
+            self.x.shape[0],
+        )
         self.x, self._new = self._new, self.x
-        moved, total = sums.sum(axis=0)
-        self.change = relative_change(moved, total)
+        self.change = relative_change(*sums.sum(axis=0))
         if not last:
             self._lanes = self.engine.to_lanes(self.x)
             self.engine.rows_forward(self._lanes)
@@ -81,8 +80,12 @@ def _direction(x, row, column, softening):  # type: ignore[no-untyped-def]
 
 
 @compiled()
-def _smooth_rows(x, correction, new, smoothing, softening, dark, sums, start, stop):  # type: ignore[no-untyped-def]
-    """Compute `new` by Eq. (1) on rows [start, stop). Set values below `dark` to 0. Sum (change)^2 and x^2 by row."""
+def _smooth_rows(planes, smoothing, softening, dark, sums, start, stop):  # type: ignore[no-untyped-def]
+    """Compute `new` by Eq. (1) on rows [start, stop). Set values below `dark` to 0. Sum (change)^2 and x^2 by row.
+
+    planes: x, correction, new.
+    """
+    x, correction, new = planes
     zero, one = np.float32(0.0), np.float32(1.0)
     for row in range(start, stop):
         moved, total = 0.0, 0.0

@@ -50,14 +50,13 @@ class _Best:
     distinguished: float
 
 
+def _unsearched(view: View) -> Sequence[Change]:
+    """The changes of an effect before `_searching` gives it those of its best template."""
+    return []
+
+
 def _searching(
-    name: str,
-    family: str,
-    parameters: tuple[Parameter, ...],
-    cause: str,
-    settled_by: str,
-    axes: tuple[str, ...],
-    trials: int,
+    plain: Effect,
     search: Callable[[View], _Best],
     changes: Callable[[View, Any], Sequence[Change]],
     described: Callable[[Any], str] = lambda template: "",
@@ -66,32 +65,23 @@ def _searching(
     by a template. described(template): the text that follows the cause if the template is held."""
 
     def best(view: View) -> _Best:
-        return view.once(name, lambda: search(view))
+        return view.once(plain.name, lambda: search(view))
 
     def held(view: View) -> Effect:
         found = best(view)
         return replace(
-            effect,
-            cause=cause[:-1] + described(found.template) + ".",
+            plain,
+            cause=plain.cause[:-1] + described(found.template) + ".",
             changes=lambda view: changes(view, found.template),
             distinguished=lambda view: found.distinguished,
-            held=None,
         )
 
-    effect = Effect(
-        name,
-        "optics",
-        parameters,
-        cause,
-        settled_by,
-        axes,
+    return replace(
+        plain,
         changes=lambda view: changes(view, best(view).template),
-        trials=trials,
         distinguished=lambda view: best(view).distinguished,
         held=held,
-        family=family,
     )
-    return effect
 
 
 def _by_psf(view: View, blur: Blur, weight: Field | None = None) -> Change:
@@ -264,9 +254,10 @@ def _mesh(view: View, form: Callable[[Kernel, float], Kernel], amount: float) ->
 
 
 EFFECTS: tuple[Effect, ...] = (
-    _searching("ghost", "ghost", (Parameter("share", "", 0.02, True), Parameter("shift_x", "px", 0.02), Parameter("shift_y", "px", 0.02),
+    _searching(Effect("ghost", "optics", (Parameter("share", "", 0.02, True), Parameter("shift_x", "px", 0.02), Parameter("shift_y", "px", 0.02),
                                    Parameter("magnified", "px/field", 0.04), Parameter("turned", "px/field", 0.04)), "A reflection adds a displaced, defocused copy of the image.",
-               "images of a bright source at several positions in the field", ("detector_x", "detector_y", "intensity"), GHOST_TRIALS,
+               "images of a bright source at several positions in the field", ("detector_x", "detector_y", "intensity"),
+               _unsearched, trials=GHOST_TRIALS, family="ghost"),
                _ghost, lambda view, copy: _copy(view, *copy), _where_copied),
     Effect("anisotropic_scatter", "optics", (Parameter("p", "", 0.1), Parameter("q", "", 0.1)),
            "Scatter reaches farther along one direction. p and q are ln(1 + stretch) times the cosine and the sine of twice the angle of this direction.",
@@ -276,15 +267,19 @@ EFFECTS: tuple[Effect, ...] = (
            (Parameter("x", "/field", 0.1), Parameter("y", "/field", 0.1), Parameter("outwards", "/field2", 0.2)),
            "The total scatter varies across the detector, linearly or from its centre outwards.", "a transit across another part of the detector",
            ("detector_x", "detector_y"), _field_dependent, _not_a_power_law, family="psf_place"),
-    _searching("wide_halo", "psf", (Parameter("share", "", 0.1, True),), "The scatter has a second, wide component.",
-               "an eclipse, or a transit of a larger occulter", ("scattering_distance", "pointing", "intensity"), len(HALOS), _halo, _as_halo),
-    _searching("core_blur", "core", (Parameter("variance", "px2", 1.0, True),), "Jitter or defocus widens the core.",
-               "an image of a sharp limb or of a point source", ("radius_in_disc", "azimuth_in_disc"), len(BLURS),
+    _searching(Effect("wide_halo", "optics", (Parameter("share", "", 0.1, True),), "The scatter has a second, wide component.",
+               "an eclipse, or a transit of a larger occulter", ("scattering_distance", "pointing", "intensity"),
+               _unsearched, trials=len(HALOS), family="psf"), _halo, _as_halo),
+    _searching(Effect("core_blur", "optics", (Parameter("variance", "px2", 1.0, True),), "Jitter or defocus widens the core.",
+               "an image of a sharp limb or of a point source", ("radius_in_disc", "azimuth_in_disc"),
+               _unsearched, trials=len(BLURS), family="core"),
                _core_blur, lambda view, blur: blur_as(view, *blur)),
-    _searching("mesh_rotation", "psf", (Parameter("angle", "deg", 3.0),), "The meshes are rotated relative to the detector.",
-               "the diffraction arms of a flare", ("azimuth_in_disc", "detector_x", "detector_y"), 2 * len(ANGLES_DEG),
+    _searching(Effect("mesh_rotation", "optics", (Parameter("angle", "deg", 3.0),), "The meshes are rotated relative to the detector.",
+               "the diffraction arms of a flare", ("azimuth_in_disc", "detector_x", "detector_y"),
+               _unsearched, trials=2 * len(ANGLES_DEG), family="psf"),
                lambda view: _amount(view, _turned, ANGLES_DEG), lambda view, angle_deg: _mesh(view, _turned, angle_deg)),
-    _searching("mesh_pitch", "psf", (Parameter("stretch", "%", 3.0),), "The pitch of the meshes differs from its nominal value.",
-               "the diffraction arms of a flare", ("radius_in_disc", "azimuth_in_disc"), 2 * len(PITCHES_PCT),
+    _searching(Effect("mesh_pitch", "optics", (Parameter("stretch", "%", 3.0),), "The pitch of the meshes differs from its nominal value.",
+               "the diffraction arms of a flare", ("radius_in_disc", "azimuth_in_disc"),
+               _unsearched, trials=2 * len(PITCHES_PCT), family="psf"),
                lambda view: _amount(view, _stretched, PITCHES_PCT), lambda view, percent: _mesh(view, _stretched, percent)),
 )  # fmt: skip

@@ -16,6 +16,7 @@ from service.cli.options import (
     JSON,
     OUTPUT,
     PLOT,
+    is_local,
     options_of,
     progress_bar,
     psf_limits,
@@ -46,16 +47,13 @@ def build(
     instrument: str,
     output: Path,
     plot: Path | None,
-    server: str | None,
-    local: bool,
-    overwrite: bool,
     **parameters: Any,
 ) -> None:
     """Compute the PSF of an instrument."""
     with (
         user_errors(),
         _mask_of(instrument) as mask,
-        connection(server, local) as service,
+        connection() as service,
         progress_bar() as report,
     ):
         built = service.build_psf(
@@ -64,7 +62,6 @@ def build(
             mask=mask,
             preview=plot,
             progress=report,
-            overwrite=overwrite,
             **parameters,
         )
     echo(f"{output}: {built['name']} {built['version']} ({built['status']}), id {short(built['id'])}")
@@ -88,20 +85,16 @@ def fit(
     output: Path,
     json_file: Path | None,
     plot: Path | None,
-    server: str | None,
-    local: bool,
-    overwrite: bool,
     **parameters: Any,
 ) -> None:
     """Fit the scattered light in TRANSIT: a folder with a transit.json, or a .zip or .tar file of such a folder."""
-    with user_errors(), connection(server, local) as service, progress_bar() as say:
+    with user_errors(), connection() as service, progress_bar() as say:
         fitted = service.fit_psf(
             transit,
             output,
             report=json_file,
             preview=plot,
             progress=say,
-            overwrite=overwrite,
             **parameters,
         )
     found = fitted["details"]["fit"]
@@ -109,7 +102,7 @@ def fit(
     say_fit(found)
     for limit in found["limits"]:
         echo(f"  note: {limit}")
-    here = " --local" if local else ""
+    here = " --local" if is_local() else ""
     echo(f"next: `heliopsf report {transit}{here} -o PAGE.html` tests the fit on images that it did not use")
 
 
@@ -136,19 +129,15 @@ def crossval(
     transit: Path,
     json_file: Path,
     plot: Path | None,
-    server: str | None,
-    local: bool,
-    overwrite: bool,
     **parameters: Any,
 ) -> None:
     """Estimate the uncertainty of the fit to TRANSIT: hold out blocks of images and bootstrap the other images, in many runs."""
-    with user_errors(), connection(server, local) as service, progress_bar() as report:
+    with user_errors(), connection() as service, progress_bar() as report:
         found = service.cross_validate(
             transit,
             json_file,
             preview=plot,
             progress=report,
-            overwrite=overwrite,
             **parameters,
         )
     echo(f"{json_file}: {found['details']['sentence']}")

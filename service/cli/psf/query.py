@@ -114,12 +114,11 @@ def query(
     profile: bool,
     compare: str | None,
     json_file: Path | None,
-    server: str | None,
     overwrite: bool,
 ) -> None:
     """Show the light of a PSF beyond radii or in an annulus, and the difference from another PSF."""
     answers: dict[str, Any] = {}
-    with user_errors(), _asking(server, psf, compare) as ask:
+    with user_errors(), _asking(psf, compare) as ask:
         if radii or not (annulus or profile or compare):
             reach_px = ask("encircled", radius=0.0)["reach_px"]
             shown = list(radii) or [r for r in SHOWN_RADII_PX if r <= reach_px]
@@ -143,13 +142,13 @@ def query(
 @click.option("-o", "--output", required=True, type=OUTPUT, help="Write the part (FITS)")
 @SERVER_FOR_IDS
 @writes_files
-def cutout(psf: str, size: int, output: Path, server: str | None, overwrite: bool) -> None:
+def cutout(psf: str, size: int, output: Path, overwrite: bool) -> None:
     """Write the central part of a PSF, not renormalised. If the PSF is a file, the components are written too."""
     from psfcore.psf import central_part
 
     with user_errors():
         if is_psf_id(psf):
-            with remote(server) as service:
+            with remote() as service:
                 service.psf_cutout(psf, size, output, overwrite=overwrite)
         else:
             _write(output, central_part(_read(psf), size), overwrite)
@@ -162,11 +161,11 @@ def cutout(psf: str, size: int, output: Path, server: str | None, overwrite: boo
 @click.option("-o", "--output", required=True, type=OUTPUT, help="Write the binned PSF (FITS)")
 @SERVER_FOR_IDS
 @writes_files
-def rebin(psf: str, factor: int, output: Path, server: str | None, overwrite: bool) -> None:
+def rebin(psf: str, factor: int, output: Path, overwrite: bool) -> None:
     """Write the PSF for images that are binned by FACTOR x FACTOR pixels."""
     from psfcore.psf_sampling import rebinned
 
-    with user_errors(), psf_file(server, psf) as file:
+    with user_errors(), psf_file(psf) as file:
         binned = rebinned(_read(str(file)), factor)
         _write(output, binned, overwrite)
     ny, nx = binned.kernel.shape
@@ -215,7 +214,7 @@ def _named(folder: PsfCache, psf: CachedPsf) -> str:
 
 
 @contextmanager
-def _asking(server: str | None, psf: str, other: str | None) -> Iterator[Callable[..., dict[str, Any]]]:
+def _asking(psf: str, other: str | None) -> Iterator[Callable[..., dict[str, Any]]]:
     """A function that answers questions about a PSF, and compares it with another one: the service answers for ids; for
     files the tables are computed here."""
     psfs = [psf] if other is None else [psf, other]
@@ -235,7 +234,7 @@ def _asking(server: str | None, psf: str, other: str | None) -> Iterator[Callabl
 
         yield ask_files
         return
-    with remote(server) as service:
+    with remote() as service:
         ids = [whole_id(service, "psfs", one) for one in psfs]
 
         def ask_service(question: str, **query: Any) -> dict[str, Any]:

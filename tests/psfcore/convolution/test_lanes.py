@@ -95,11 +95,11 @@ from psfcore.convolution.fft_kernels import forward, inverse, make_plan
 x = np.random.default_rng(0).standard_normal((1152, 2, 16)).astype(np.float32)
 plan = make_plan(1152)  # radices 3, 3, 2, 8, 8
 buffer = x.ravel().copy()
-forward(buffer, *plan.numbers)
+forward(buffer, plan)
 found = buffer.reshape(x.shape)
-expected = np.fft.fft(x[:, 0] + 1j * x[:, 1], axis=0)[plan.frequency]
+expected = np.fft.fft(x[:, 0] + 1j * x[:, 1], axis=0)[np.argsort(plan.place)]
 assert np.abs(found[:, 0] + 1j * found[:, 1] - expected).max() < 1e-6 * np.abs(expected).max()
-inverse(buffer, *plan.numbers)
+inverse(buffer, plan)
 assert np.abs(buffer.reshape(x.shape) / 1152 - x).max() < 2e-6
 print("equal")
 """

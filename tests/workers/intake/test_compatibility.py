@@ -27,7 +27,7 @@ from workers.contract.requests import Parameters, PsfBuild, PsfFit, ResolvedDeco
 from workers.intake import requests
 from workers.intake.compatibility import check, details_now, suits
 from workers.intake.requests import Submission, resolve_by_ids
-from workers.intake.uploads import image_row, uploaded_psf_row
+from workers.intake.uploads import Upload, image_row, uploaded_psf_row
 from workers.versions import PsfStatus
 
 AIA = {"TELESCOP": "SDO/AIA", "INSTRUME": "AIA_3", "WAVELNTH": 171, "CDELT1": 0.6, "CDELT2": 0.6}
@@ -42,7 +42,7 @@ FEW = {"steps": 1}
 def summary_of(tmp_path: Path, **cards: Any) -> dict[str, Any]:
     (tmp_path / "i.fits").unlink(missing_ok=True)
     write_image(tmp_path / "i.fits", **cards)
-    row: ImageRow = image_row("a", "0" * 64, 1, "i.fits", read_summary(tmp_path / "i.fits", LIMITS))
+    row: ImageRow = image_row(Upload("a", "0" * 64, 1, "i.fits"), read_summary(tmp_path / "i.fits", LIMITS))
     return dict(row.summary)
 
 
@@ -54,7 +54,9 @@ def psf_of(
     for key, value in cards.items():
         fits.setval(tmp_path / "p.fits", key, value=value)
     summary = read_summary(tmp_path / "p.fits", LIMITS)
-    return uploaded_psf_row("a", "1" * 64, 1, "p.fits", summary, instrument=instrument, channel=channel)
+    return uploaded_psf_row(
+        Upload("a", "1" * 64, 1, "p.fits"), summary, instrument=instrument, channel=channel
+    )
 
 
 def request(**more: Any) -> ResolvedDeconvolve:

@@ -18,6 +18,7 @@ from psfcore.deconvolve.assess.error_planes import (
     sigma_points,
     spread_of_results,
 )
+from psfcore.deconvolve.conditions import Conditions
 from psfcore.deconvolve.work import Options, Work
 from psfcore.errors import DataError
 from psfcore.image import Image, MaskBit
@@ -62,7 +63,8 @@ def twenty_steps(psf: Psf) -> Callable[[Image], Plane]:
 
 
 def planes_of(image: Image, psf: Psf, run: Callable[[Image], Plane], **more: Any) -> ErrorPlanes:
-    return error_planes(image, psf, run, NOISE, **{"estimate": run(image), "draws": 8} | more)
+    conditions = Conditions(noise=NOISE, threads=more.pop("threads", 1), progress=more.pop("progress", None))
+    return error_planes(image, psf, run, conditions, **{"estimate": run(image), "draws": 8} | more)
 
 
 def pulls(scene: Plane, psf: Psf, images: int, draws: int) -> tuple[Plane, Plane]:
