@@ -70,7 +70,7 @@ from workers.contract.requests import (
 )
 from workers.contract.suggestions import explained
 from workers.files.archive import safe_name
-from workers.intake.costs import COSTS, linear_s
+from workers.intake.costs import job_s
 from workers.machine import cores, free_bytes, psf_cache
 from workers.settings import Settings, software_version
 from workers.stage_timer import StageTimer
@@ -263,7 +263,7 @@ class Local(Operations):
         if KINDS[kind].counted_whole or getattr(request, "transit_id", None) not in self._transits:
             return None
         pixels = self._transits[request.transit_id].contents.pixels
-        return linear_s(kind, request.model_dump(), pixels) / cores() ** COSTS.threads_exponent
+        return job_s(kind, request.model_dump(), pixels) / cores()
 
     def get(self, address: str) -> dict[str, Any]:
         """The description of a result."""
