@@ -58,7 +58,8 @@ def test_a_broken_download_is_resumed_if_the_server_has_the_same_file(tmp_path: 
             server.broken = 2  # both tries of the first download
             with pytest.raises(DataError, match="psf-not-downloaded"):
                 get(folder, NAME)
-            kept = (folder / f"{NAME}.part").stat().st_size
+            (part,) = folder.glob(f"{NAME}.*.part")
+            kept = part.stat().st_size
             assert 0 < kept < whole and server.sent[0] == whole > server.sent[1]
             server.files["/psf"] = server.published = again
             psf = read_psf(get(folder, NAME), LIMITS)
@@ -100,6 +101,10 @@ def sends_much(request: BaseHTTPRequestHandler) -> None:
         request.wfile.write(bytes(8 * SIZE_PX**2))
 
 
+def checksum_of_another_folder(request: BaseHTTPRequestHandler) -> None:
+    answer(request, 200, b'{"data": {"dataFile": {"checksum": {"type": "MD5", "value": "/../../x"}}}}')
+
+
 def no_json(request: BaseHTTPRequestHandler) -> None:
     answer(request, 200, b"<html>sign in</html>")
 
@@ -122,6 +127,7 @@ def to(address: str) -> Fault:
         ("/psf", to("/psf"), "at most 5 redirections"),
         (CHECKSUM, no_json, "expected the checksum of psf_aia_193.fits"),
         (CHECKSUM, unknown_checksum, "expected the checksum of psf_aia_193.fits"),
+        (CHECKSUM, checksum_of_another_folder, "expected the checksum of psf_aia_193.fits"),
         (CHECKSUM, lambda request: request.send_error(503), "503"),
     ],
 )
