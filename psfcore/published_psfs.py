@@ -244,9 +244,8 @@ def _download(
                     raise requests.RequestException(
                         f"expected the whole file or its rest; got status {answer.status_code} and Content-Range {extent}"
                     )
-            for block in chain(
-                [b""], answer.iter_content(_BLOCK_BYTES)
-            ):  # the announced size is checked first
+            # The empty block lets the announced size be checked first.
+            for block in chain([b""], answer.iter_content(_BLOCK_BYTES)):
                 done += file.write(block)
                 if max(done, total) > most:
                     part.unlink()
@@ -263,7 +262,7 @@ def _download(
             raise OSError(f"expected the {algorithm} {expected}; got {got}")
         os.replace(part, output_file)
     for other in folder.glob(f"{one.name}.*.part"):  # of another version of the file
-        other.unlink()
+        other.unlink(missing_ok=True)
 
 
 def _as_psf(one: Published, file: Path, sha256: str) -> Psf:

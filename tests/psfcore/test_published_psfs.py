@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from http.server import BaseHTTPRequestHandler
@@ -101,16 +102,13 @@ def sends_much(request: BaseHTTPRequestHandler) -> None:
         request.wfile.write(bytes(8 * SIZE_PX**2))
 
 
-def checksum_of_another_folder(request: BaseHTTPRequestHandler) -> None:
-    answer(request, 200, b'{"data": {"dataFile": {"checksum": {"type": "MD5", "value": "/../../x"}}}}')
-
-
 def no_json(request: BaseHTTPRequestHandler) -> None:
     answer(request, 200, b"<html>sign in</html>")
 
 
-def unknown_checksum(request: BaseHTTPRequestHandler) -> None:
-    answer(request, 200, b'{"data": {"dataFile": {"checksum": {"type": "CRC", "value": "0"}}}}')
+def tells(algorithm: str, value: str) -> Fault:
+    checksum = {"data": {"dataFile": {"checksum": {"type": algorithm, "value": value}}}}
+    return lambda request: answer(request, 200, json.dumps(checksum).encode())
 
 
 def to(address: str) -> Fault:
@@ -126,8 +124,8 @@ def to(address: str) -> Fault:
         ("/psf", sends_much, "more than twice as much"),
         ("/psf", to("/psf"), "at most 5 redirections"),
         (CHECKSUM, no_json, "expected the checksum of psf_aia_193.fits"),
-        (CHECKSUM, unknown_checksum, "expected the checksum of psf_aia_193.fits"),
-        (CHECKSUM, checksum_of_another_folder, "expected the checksum of psf_aia_193.fits"),
+        (CHECKSUM, tells("CRC", "00"), "expected the checksum of psf_aia_193.fits"),
+        (CHECKSUM, tells("MD5", "/../../x"), "expected the checksum of psf_aia_193.fits"),
         (CHECKSUM, lambda request: request.send_error(503), "503"),
     ],
 )
@@ -154,12 +152,9 @@ def test_redirections_stay_at_the_servers_of_the_repository(tmp_path: Path, path
             ):
                 get(tmp_path, NAME)
         assert other.asked == []
-        server.faults = {"/psf": to("/file"), CHECKSUM: to(server.address + "/told")}
+        told = tells("SHA-256", hashlib.sha256(published_fits()).hexdigest())
+        server.faults = {"/psf": to("/file"), CHECKSUM: to(server.address + "/told"), "/told": told}
         server.files["/file"] = published_fits()
-        told = hashlib.sha256(published_fits()).hexdigest()
-        server.files["/told"] = (
-            b'{"data": {"dataFile": {"checksum": {"type": "SHA-256", "value": "%s"}}}}' % told.encode()
-        )
         assert get(tmp_path, NAME).is_file()
 
 
