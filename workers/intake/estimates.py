@@ -102,7 +102,7 @@ def estimate(
     elif kind == "psf-build":
         cpu_s, mib = estimate_build(parameters, catalogue, owner)
     else:
-        cpu_s, mib = _other(kind, parameters, catalogue, owner)
+        cpu_s, mib = _linear(kind, parameters, catalogue, owner)
     start_s = cpu_s / threads
     return Estimate(
         memory_mib=round(WORKER_MIB + mib),
@@ -142,7 +142,7 @@ def _deconvolution(parameters: Mapping[str, Any], catalogue: Catalogue, owner: s
         psf_shape = tuple(psf.details["shape"])
     elif parameters.get("psf_interpolation") is not None:  # the PSF may still have to be interpolated
         interpolation = parameters["psf_interpolation"]
-        built_s, built_mib = _other("psf-interpolate", interpolation, catalogue, owner)
+        built_s, built_mib = _linear("psf-interpolate", interpolation, catalogue, owner)
         psf = catalogue.get(PsfRow, interpolation["before_psf_id"], owner)
         psf_shape = psf_shape if psf is None else tuple(psf.details["shape"])
     elif parameters.get("psf_recipe") is not None:  # the PSF may still have to be built
@@ -201,7 +201,9 @@ def estimate_build(
     return len(instrument.spectral_lines) * line_s, meshes_mib + GRID_MIB * grid**2 + arrays / MIB
 
 
-def _other(kind: str, parameters: Mapping[str, Any], catalogue: Catalogue, owner: str) -> tuple[float, float]:
+def _linear(
+    kind: str, parameters: Mapping[str, Any], catalogue: Catalogue, owner: str
+) -> tuple[float, float]:
     cost, pixels = COSTS.get(kind, OTHER), _pixels(parameters, catalogue, owner)
     built_s, built_mib = 0.0, 0.0
     if parameters.get("diffraction_recipe") is not None:
