@@ -1,7 +1,7 @@
 """A folder of built PSFs, so that a PSF is built only once: `kept_psf` reads a PSF from it, or builds and keeps it.
 
 The name of a file is IDENTITY.PART: the identity of the PSF (`psfcore.recipe`), and the content of the file, such as "fits". A file
-is written under a temporary name and then renamed; when it is read, its cards CHECKSUM and DATASUM prove that it is whole. If the
+is written under a temporary name and then renamed; when it is read, the card CHECKSUM of its HDUs proves that it is whole. If the
 files need more space than allowed, the files of the least recently used PSF are removed.
 
 Other users have no access to the folder, because the files in it are used without any other check.
