@@ -1,11 +1,9 @@
-"""Time and memory of jobs, beside the estimates of workers/intake/estimates.py.
+"""Time and memory of jobs, beside the estimates of workers/intake.
 
-    python -m benchmarks.estimates [--full] [--write]
+    python -m benchmarks.estimates [--full]
 
 Each case runs in its own process with one thread; its processor time and peak memory are measured. --full also measures
 studies of a transit of 512 px, an image of 4096 px and an image with an ERROR plane (about twenty minutes more).
---write multiplies the times of each kind in estimates.json by the median ratio of measured to estimated time; each
-method of deconvolution has a ratio of its own. Memory is only printed.
 """
 
 from __future__ import annotations
@@ -15,10 +13,8 @@ import json
 import subprocess
 import sys
 import time
-from collections import defaultdict
 from collections.abc import Iterable
 from pathlib import Path
-from statistics import median
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -29,7 +25,6 @@ from tests.fitted_psfs import EARLY, LATE, write_fitted
 from tests.in_process import InProcess
 from workers.catalogue.tables import DEFAULT_OWNER
 from workers.intake import estimates
-from workers.intake.costs import COSTS_FILE, Costs
 from workers.settings import Settings
 
 Case = dict[str, Any]
@@ -125,30 +120,12 @@ def measured(case: Case, folder: Path) -> dict[str, Any]:
         service.wait(job)
         took_s = time.process_time() - started
         service.close()
-    method = case.get("method", {}).get("name", "")
-    times = {"kind": case["kind"], "method": method, "took_s": took_s, "estimated_s": said.start_s}
-    return times | {"mib": memory_bytes("VmHWM") / 2**20, "estimated_mib": said.memory_mib}
-
-
-def write(measurements: list[dict[str, Any]]) -> None:
-    """Correct the times in estimates.json by these measurements."""
-    content = json.loads(COSTS_FILE.read_text("utf-8"))
-    ratios: dict[tuple[str, str], list[float]] = defaultdict(list)
-    for one in measurements:
-        ratios[one["kind"], one["method"]].append(one["took_s"] / one["estimated_s"])
-    for (kind, method), found in ratios.items():
-        times = content["kinds"][kind]
-        if method:
-            before = times["step_ns"].get(method, max(times["step_ns"].values()))
-            times["step_ns"][method] = round(before * median(found), 3)
-            continue
-        for name, value in times.items():
-            if name.endswith(("_s", "_ns")):
-                times[name] = round(value * median(found), 3)
-        for scheme, pair in times.get("run", {}).items():
-            times["run"][scheme] = [round(value * median(found), 3) for value in pair]
-    Costs.model_validate(content)
-    Path(str(COSTS_FILE)).write_text(json.dumps(content, indent=2) + "\n", "utf-8")
+    return {
+        "took_s": took_s,
+        "estimated_s": said.start_s,
+        "mib": memory_bytes("VmHWM") / 2**20,
+        "estimated_mib": said.memory_mib,
+    }
 
 
 def main() -> None:
@@ -157,14 +134,12 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--full", action="store_true")
-    parser.add_argument("--write", action="store_true")
     parser.add_argument("--one", nargs=2, help=argparse.SUPPRESS)
     chosen = parser.parse_args()
     if chosen.one:
         case, folder = chosen.one
         print(json.dumps(measured(json.loads(case), Path(folder))))
         return
-    measurements: list[dict[str, Any]] = []
     print(f"{'measured':>20}{'estimated':>20}")
     with TemporaryDirectory(prefix="heliopsf-estimates-") as folder:
         for case in QUICK + (FULL if chosen.full else []):
@@ -173,13 +148,10 @@ def main() -> None:
                 {"NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
             )
             found = answer_of("benchmarks.estimates", *words, **one_thread)
-            measurements.append(found)
             times = f"{found['took_s']:8.1f} s {found['mib']:6.0f} MiB"
             said = f"{found['estimated_s']:8.1f} s {found['estimated_mib']:6d} MiB"
             name = " ".join(str(one.get("name") if isinstance(one, dict) else one) for one in case.values())
             print(f"{times} {said}   {name}", flush=True)
-    if chosen.write:
-        write(measurements)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """A folder of built PSFs, so that a PSF is built only once: `kept_psf` reads a PSF from it, or builds and keeps it.
 
-The name of a file is IDENTITY.SHA256.PART: the identity of the PSF (`psfcore.recipe`), the hash of the file, and
-the content of the file, such as "fits". A file is written under a temporary name and then renamed. Its hash is checked
-when it is read. If the files need more space than allowed, the files of the least recently used PSF are removed.
+The name of a file is IDENTITY.PART: the identity of the PSF (`psfcore.recipe`), and the content of the file, such as "fits". A file
+is written under a temporary name and then renamed; when it is read, the card CHECKSUM of its HDUs proves that it is whole. If the
+files need more space than allowed, the files of the least recently used PSF are removed.
 
 Other users have no access to the folder, because the files in it are used without any other check.
 """
@@ -10,22 +10,22 @@ Other users have no access to the folder, because the files in it are used witho
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import shutil
 import time
-import uuid
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from psfcore.errors import DataError
-from psfcore.files import PARTIAL, sha256_of
+from psfcore.files import PARTIAL, whole_path
+from psfcore.fits.blocks import BLOCK_BYTES
 from psfcore.recipe import Recipe
 
 if TYPE_CHECKING:
@@ -34,12 +34,14 @@ if TYPE_CHECKING:
     from psfcore.fits.blocks import FitsLimits
     from psfcore.psf import Psf
 
-FITS, PROVENANCE = "fits", "provenance.json"  # parts that every builder keeps
-# The same for a PSF that was built for a deconvolution: its kernel is equal, but it has no components.
-TOTAL_FITS, TOTAL_PROVENANCE = "total.fits", "total.provenance.json"
-_NAME = re.compile(r"([0-9a-f]{64})\.([0-9a-f]{64})\.([a-z.]+)")
+FITS, PROVENANCE = "fits", "json"
+TOTAL_FITS = (
+    "total.fits"  # a PSF that was built for a deconvolution: its kernel is equal, but it has no components
+)
+_NAME = re.compile(r"[0-9a-f]{64}\..+")
 _TEMPORARY = re.compile(rf"\..*{re.escape(PARTIAL)}")
 _OTHERS = 0o077  # permissions of the group and of all other users
+_PIECE_BYTES = 2**22
 _ABANDONED_S = 86_400.0  # a temporary file of this age belongs to no running process
 
 
@@ -63,55 +65,45 @@ class PsfCache:
         self.folder = folder
         self.max_bytes = max_bytes
 
-    def find(self, identity: str, part: str) -> Path | None:
-        """A file of a PSF, after its content was checked; None if the cache has no such file.
-
-        A damaged file is removed.
-        """
-        for path in self._files():
-            of, sha256, found_part = path.name.split(".", 2)
-            if (of, found_part) != (identity, part):
-                continue
-            try:
-                if sha256_of(path) == sha256:
-                    # The access time of the file is set to now: it records the last use. The modification time is not
-                    # changed, because other running commands use it to notice that a file was replaced.
-                    os.utime(path, ns=(time.time_ns(), path.stat().st_mtime_ns))
-                    return path
-                path.unlink()
-            except FileNotFoundError:  # another process removed it
-                continue
+    def find(self, identity: str, part: str = FITS) -> Path | None:
+        """The FITS file of a PSF; None if the cache does not have it. A damaged file is removed."""
+        path = self.folder / f"{identity}.{part}"
+        with suppress(FileNotFoundError):  # the cache does not have it, or another process removed it
+            if not self._ours():
+                return None
+            if _whole(path):
+                # The access time of the file is set to now: it records the last use. The modification time is not
+                # changed, because other running commands use it to notice that a file was replaced.
+                os.utime(path, ns=(time.time_ns(), path.stat().st_mtime_ns))
+                return path
+            path.unlink()
         return None
 
-    def keep(self, identity: str, part: str, write: Callable[[Path], object]) -> Path | None:
-        """Keep a file. ``write(path)`` writes it. Returns None if the file is larger than the largest size of the
-        cache.
+    def provenance(self, identity: str) -> dict[str, Any]:
+        """How a PSF of the cache was made; empty if this was not kept."""
+        try:
+            found: dict[str, Any] = json.loads((self.folder / f"{identity}.{PROVENANCE}").read_bytes())
+        except (FileNotFoundError, ValueError):
+            return {}
+        return found
+
+    def keep(self, identity: str, part: str, file: Path) -> None:
+        """Keep a copy of a file, unless it is larger than the cache may be.
 
         Raises DataError "cache-of-another-user", and OSError if the file cannot be written.
         """
-        if self.max_bytes == 0:
-            return None
+        if file.stat().st_size > self.max_bytes:
+            return
         self._make_private()
-        unfinished = self.folder / f".{uuid.uuid4().hex}{PARTIAL}"
-        try:
+        with whole_path(self.folder / f"{identity}.{part}") as unfinished:
             unfinished.touch(mode=0o600)
-            write(unfinished)
-            unfinished.chmod(0o600)
-            with unfinished.open("rb") as written:
-                os.fsync(written.fileno())
-            if unfinished.stat().st_size > self.max_bytes:
-                return None
-            kept = self.folder / f"{identity}.{sha256_of(unfinished)}.{part}"
-            unfinished.replace(kept)
-        finally:
-            unfinished.unlink(missing_ok=True)
-        self._shrink(identity)
-        return kept
+            shutil.copyfile(file, unfinished)
+        self._shrink(self.max_bytes, identity)
 
     def psfs(self) -> list[CachedPsf]:
         """The PSFs in the cache; the most recently used PSF comes first."""
         files: dict[str, list[tuple[Path, os.stat_result]]] = {}
-        for path in self._files():
+        for path in self._files(_NAME):
             with suppress(FileNotFoundError):  # another process removed it
                 files.setdefault(path.name.split(".")[0], []).append((path, path.stat()))
         psfs = [
@@ -127,43 +119,38 @@ class PsfCache:
 
     def clear(self) -> int:
         """Remove all files; returns the size of the PSFs in bytes. Other files in the folder stay."""
-        removed = self.psfs()
-        for psf in removed:
-            _remove(psf)
-        for leftover in self._files(_TEMPORARY):
-            leftover.unlink(missing_ok=True)
-        return sum(psf.bytes for psf in removed)
+        return self._shrink(-1, abandoned_s=-math.inf)
 
-    def _files(self, pattern: re.Pattern[str] = _NAME) -> list[Path]:
-        """The files with such names, by default those of PSFs; none if there is no folder or it belongs to another user."""
-        if not self.folder.is_dir() or self._of_another_user():
-            return []
-        return sorted(path for path in self.folder.iterdir() if pattern.fullmatch(path.name))
+    def _files(self, pattern: re.Pattern[str]) -> list[Path]:
+        """The files with such names; none if there is no folder or it belongs to another user."""
+        found = self.folder.iterdir() if self._ours() else ()
+        return sorted(path for path in found if pattern.fullmatch(path.name))
 
-    def _shrink(self, last: str) -> None:
-        """Remove the least recently used PSFs until the others fit.
+    def _shrink(self, most_bytes: int, last: str = "", *, abandoned_s: float = _ABANDONED_S) -> int:
+        """Remove the least recently used PSFs until the others fit, and what killed processes left; returns the size of these PSFs.
 
         The PSF with the identity ``last`` is never removed.
         """
         psfs = self.psfs()
-        total = sum(psf.bytes for psf in psfs)
+        total = before = sum(psf.bytes for psf in psfs)
         for psf in reversed(psfs):
-            if total <= self.max_bytes:
-                break
-            if psf.identity != last:
-                _remove(psf)
+            if total > most_bytes and psf.identity != last:
                 total -= psf.bytes
-        for leftover in self._files(_TEMPORARY):  # killed processes leave such files
+                for path in psf.files:
+                    path.unlink(missing_ok=True)
+        for leftover in self._files(_TEMPORARY):
             with suppress(FileNotFoundError):
-                if time.time() - leftover.stat().st_mtime > _ABANDONED_S:
+                if time.time() - leftover.stat().st_mtime > abandoned_s:
                     leftover.unlink()
+        return before - total
 
-    def _of_another_user(self) -> bool:
-        return self.folder.stat().st_uid != os.geteuid()
+    def _ours(self) -> bool:
+        """Whether the folder is there and belongs to this user."""
+        return self.folder.is_dir() and self.folder.stat().st_uid == os.geteuid()
 
     def _make_private(self) -> None:
         self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if self._of_another_user():
+        if not self._ours():
             raise DataError(
                 "cache-of-another-user",
                 f"expected the folder {self.folder} to belong to you; it belongs to another user: name another folder with "
@@ -173,9 +160,18 @@ class PsfCache:
             self.folder.chmod(0o700)
 
 
-def _remove(psf: CachedPsf) -> None:
-    for path in psf.files:
-        path.unlink(missing_ok=True)
+def _whole(path: Path) -> bool:
+    """Whether a FITS file is as it was written: in ones' complement, the 32-bit words of each HDU with the card CHECKSUM sum to -0.
+
+    FITS standard 4.0, Appendix J.
+    """
+    import numpy as np  # `heliopsf cache list` needs no numerical libraries
+
+    total = 0
+    with path.open("rb") as file:
+        while words := file.read(_PIECE_BYTES):
+            total += int(np.frombuffer(words, ">u4", len(words) // 4).sum(dtype=np.uint64))
+        return total > 0 and total % 0xFFFFFFFF == 0 and file.tell() % BLOCK_BYTES == 0
 
 
 @contextmanager
@@ -194,27 +190,23 @@ def built_file(
     built again; its kernel is the same. progress is called while the PSF is built. If the cache cannot be used, the PSF is
     built in every call, with a warning.
     """
-    names = (FITS, PROVENANCE)
-    fits = cache.find(recipe.identity, FITS)
-    if fits is None and not parts:
-        names = (TOTAL_FITS, TOTAL_PROVENANCE)
-        fits = cache.find(recipe.identity, TOTAL_FITS)
+    identity = recipe.identity
+    fits = cache.find(identity) or (None if parts else cache.find(identity, TOTAL_FITS))
     if fits is not None:
-        provenance = cache.find(recipe.identity, names[1])
-        yield fits, {"psf_id": recipe.identity} if provenance is None else json.loads(provenance.read_bytes())
+        yield fits, cache.provenance(identity) or {"psf_id": identity}
         return
     # A command that finds its PSF does not load the libraries of the diffraction.
     from psfcore.build import build_recipe
     from psfcore.fits.psfs import write_psf
 
     psf = build_recipe(recipe, parts=parts, mount_image=mount_image, threads=threads, progress=progress)
-    text = json.dumps(psf.provenance, allow_nan=False)
     with TemporaryDirectory(prefix="heliopsf-") as folder:
-        path = Path(folder) / "psf.fits"
+        path, about = Path(folder) / "psf.fits", Path(folder) / "provenance.json"
         write_psf(path, psf, instrument_file=recipe.text.encode())
+        about.write_text(json.dumps(psf.provenance, allow_nan=False))
         try:
-            cache.keep(recipe.identity, names[1], lambda part: part.write_text(text))
-            cache.keep(recipe.identity, names[0], partial(shutil.copyfile, path))
+            cache.keep(identity, PROVENANCE, about)
+            cache.keep(identity, FITS if parts else TOTAL_FITS, path)
         except (OSError, DataError) as error:
             warnings.warn(f"the PSF is not kept and will be built again: {error}", stacklevel=4)
         yield path, psf.provenance

@@ -117,7 +117,7 @@ FAULTS = (
     Fault("blind-half-of-a-pair-counts", "psfcore/blind/judge.py",
           'if all(self.matches(one, level)', 'if any(self.matches(one, level)'),
     Fault("built-damaged-psf-used", "psfcore/psf_cache.py",
-          'if sha256_of(path) == sha256:', 'if path.is_file():'),
+          'if _whole(path):', 'if path.is_file():'),
     Fault("catalogue-claim-without-compare", "workers/catalogue/jobs.py",
           'update(JobRow).where(JobRow.id == job_id, JobRow.phase == Phase.QUEUED)',
           'update(JobRow).where(JobRow.id == job_id)'),

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from hashlib import md5, sha256
+from hashlib import md5
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from io import BytesIO
 from unittest.mock import patch
@@ -77,10 +77,7 @@ def stand_in(*paths: str) -> Iterator[StandIn]:
             if content is None:
                 self.send_error(404)
                 return
-            version = f'"{sha256(content).hexdigest()}"'
             whole, first = len(content), int(self.headers.get("Range", "bytes=0-")[len("bytes=") : -1])
-            if self.headers.get("If-Range") != version:
-                first = 0
             content = content[first:]
             here.sent.append(len(content))
             here.broken -= 1
@@ -88,7 +85,6 @@ def stand_in(*paths: str) -> Iterator[StandIn]:
                 self,
                 206 if first else 200,
                 content[: len(content) // 2] if here.broken >= 0 else content,
-                ETag=version,
                 Content_Length=len(content),
                 Content_Range=f"bytes {first}-{whole - 1}/{whole}",
             )
@@ -102,8 +98,8 @@ def stand_in(*paths: str) -> Iterator[StandIn]:
     known = published_psfs.PUBLISHED[NAME]
     moved = replace(
         known,
-        addresses=tuple(here.address + path for path in paths),
-        origins=(here.address,),
+        addresses=[here.address + path for path in paths],
+        origins=[here.address],
         checksum_address=here.address + CHECKSUM,
         size_px=SIZE_PX,
     )

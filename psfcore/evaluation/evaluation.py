@@ -201,12 +201,12 @@ class Superposed:
     @property
     def mpe_rms_pct(self) -> float:
         """The rms of the MPE over the map."""
-        return _rms(self.mpe_pct)
+        return rms(self.mpe_pct)
 
     @property
     def mpe_noise_rms_pct(self) -> float:
         """The expected rms of the MPE from noise alone."""
-        return _rms(self.noise_mpe_pct)
+        return rms(self.noise_mpe_pct)
 
     @property
     def mpe_largest_pct(self) -> float:
@@ -250,8 +250,9 @@ def superposed(pe_pct: Map, noise_pct: Map) -> Superposed:
     )
 
 
-def _rms(values: Map) -> float:
-    return float(np.sqrt(np.nanmean(values**2)))
+def rms(values: Map) -> float:
+    """The root of the mean square of the values that are not nan; nan without any value."""
+    return float(np.sqrt(np.nanmean(values**2))) if values.size else math.nan
 
 
 # --- the evaluation ---------------------------------------------------------------------------------------

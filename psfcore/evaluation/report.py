@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.arrays import json_attributes, json_values
-from psfcore.evaluation.evaluation import Evaluation, FrameEvaluation, Slice, Superposed
+from psfcore.evaluation.evaluation import Evaluation, FrameEvaluation, Superposed, rms
 from psfcore.scatter.validation.robustness import DarkOffsetStudy
 
 Vector = NDArray[np.float64]
@@ -109,16 +109,16 @@ def summary_of(frames: Sequence[FrameEvaluation], fov: int | None) -> Summary:
         fov=fov,
         images=len(frames),
         mean_pct=float(residual.mean()),
-        mean_noise_pct=_rms(noise) / math.sqrt(len(frames)),
-        rms_pct=_rms(residual),
-        noise_pct=_rms(noise),
-        gap_pct=math.sqrt(max(_rms(residual) ** 2 - _rms(noise) ** 2, 0.0)),
+        mean_noise_pct=rms(noise) / math.sqrt(len(frames)),
+        rms_pct=rms(residual),
+        noise_pct=rms(noise),
+        gap_pct=math.sqrt(max(rms(residual) ** 2 - rms(noise) ** 2, 0.0)),
         largest_pct=float(np.abs(residual).max()),
         mean_dn_s=float(error.mean()),
-        rms_dn_s=_rms(error),
+        rms_dn_s=rms(error),
         centre_mean_pct=float(centre[there].mean()) if there.any() else math.nan,
-        centre_rms_pct=_rms(centre[there]),
-        centre_noise_pct=_rms(centre_noise[there]),
+        centre_rms_pct=rms(centre[there]),
+        centre_noise_pct=rms(centre_noise[there]),
     )
 
 
@@ -155,10 +155,6 @@ def each(frames: Sequence[FrameEvaluation], name: str) -> Vector:
     return np.array([getattr(frame, name) for frame in frames], dtype=np.float64)
 
 
-def _rms(values: Vector) -> float:
-    return float(np.sqrt(np.mean(values**2))) if values.size else math.nan
-
-
 # --- as JSON ----------------------------------------------------------------------------------------------
 
 
@@ -177,8 +173,8 @@ def report(evaluation: Evaluation, study: DarkOffsetStudy | None = None) -> dict
             {
                 "file": frame.file,
                 "fov": frame.pointing,
-                "along_x": _slice_json(frame.along_x),
-                "along_y": _slice_json(frame.along_y),
+                "along_x": json_values(frame.along_x),
+                "along_y": json_values(frame.along_y),
             }
             for frame in evaluation.frames
             if frame.along_x is not None and frame.along_y is not None
@@ -216,15 +212,6 @@ def _superposed_json(maps: Superposed) -> dict[str, Any]:
         **json_attributes(maps, "mpe_rms_pct", "mpe_noise_rms_pct", "mpe_largest_pct"),
         **json_attributes(maps, "mape_mean_pct", "mape_noise_mean_pct", "mape_largest_pct"),
         **json_attributes(maps, "count", "mpe_pct", "mape_pct", "noise_mpe_pct", "noise_mape_pct"),
-    }
-
-
-def _slice_json(along: Slice) -> dict[str, Any]:
-    return {
-        "offset_px": along.offset_px.tolist(),
-        "observed_dn_s": along.observed.tolist(),
-        "simulated_dn_s": along.simulated.tolist(),
-        "dark": along.dark.tolist(),
     }
 
 

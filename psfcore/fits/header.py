@@ -122,11 +122,6 @@ def read_summary(
     return read_first_image(path, limits, hdu=hdu)[0]
 
 
-def first_image_header(path: str | os.PathLike[str], limits: FitsLimits) -> Header:
-    """Unchanged header of the first 2-D image of a file. Raises HeaderError if the file has no usable image."""
-    return read_first_image(path, limits)[1].header
-
-
 def read_first_image(
     path: str | os.PathLike[str], limits: FitsLimits, *, hdu: int | None = None
 ) -> tuple[HeaderSummary, Hdu]:

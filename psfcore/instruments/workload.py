@@ -33,15 +33,13 @@ MOST_ORDERS = 10_000  # of a hexagonal mesh, from the centre to the corner of th
 class Workload:
     """Sizes of the arrays for one spectral line: the line with the shortest wavelength, which needs the largest arrays.
 
-    airy_points: points of the table of the analytic pattern. cells: cells of one axis of each rotated mesh. windows:
-    terms of the series of each mesh that is parallel to the pixels. orders: of each hexagonal mesh, up to the corner. mask: whether the mask of the pupil is transformed.
-    mount_entries: entries of the list of edges by rows of the mask.
+    airy_points: points of the table of the analytic pattern. cells: cells of one axis of each rotated mesh. orders:
+    of each hexagonal mesh, up to the corner. mask: whether the mask of the pupil is transformed. mount_entries: entries of the list of edges by rows of the mask.
     """
 
     samples: float
     airy_points: int
     cells: tuple[int, ...]
-    windows: tuple[int, ...]
     orders: tuple[int, ...]
     mask: bool
     mask_cells: int
@@ -70,7 +68,6 @@ def workload(instrument: Instrument, size: int) -> Workload:
         cells=tuple(
             _cells(instrument, mesh, shortest_mm, corner_px) for mesh in square if mesh.angle_deg % 90 != 0
         ),
-        windows=tuple(windows_of(mesh) for mesh in square if mesh.angle_deg % 90 == 0),
         orders=tuple(
             math.ceil(corner_px / _spacing_px(instrument, mesh, shortest_mm))
             for mesh in meshes

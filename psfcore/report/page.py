@@ -18,7 +18,6 @@ from psfcore.evaluation.evaluation import (
     INVERSION_STEPS,
     NOISE_REALISATIONS,
     Evaluation,
-    FrameEvaluation,
 )
 from psfcore.evaluation.report import TREND_PX, Summary, summaries, trends
 from psfcore.psf import REACH_GRID_PX
@@ -197,22 +196,21 @@ def limits_of(report: PsfReport) -> list[str]:
 def image_rows(report: PsfReport) -> list[Row]:
     """Every evaluated image."""
     exposure_s = {frame.file: frame.exposure_s for frame in report.transit.frames}
-    return [_image_row(frame, exposure_s[frame.file]) for frame in report.evaluation.frames]
-
-
-def _image_row(frame: FrameEvaluation, exposure_s: float) -> Row:
     return [
-        frame.file,
-        str(frame.pointing),
-        f"{frame.time_s / 60:.1f}",
-        f"{exposure_s:g}",
-        with_error(frame.found.place.x_px, frame.found.sigma_x_px),
-        with_error(frame.found.place.y_px, frame.found.sigma_y_px),
-        str(frame.dark[0].size),
-        with_error(frame.observed_dn_s, frame.noise_dn_s),
-        f"{frame.simulated_dn_s:.4g}",
-        with_error(frame.residual_pct, frame.noise_pct),
-        with_error(frame.centre_pct, frame.centre_noise_pct),
+        [
+            frame.file,
+            str(frame.pointing),
+            f"{frame.time_s / 60:.1f}",
+            f"{exposure_s[frame.file]:g}",
+            with_error(frame.found.place.x_px, frame.found.sigma_x_px),
+            with_error(frame.found.place.y_px, frame.found.sigma_y_px),
+            str(frame.dark[0].size),
+            with_error(frame.observed_dn_s, frame.noise_dn_s),
+            f"{frame.simulated_dn_s:.4g}",
+            with_error(frame.residual_pct, frame.noise_pct),
+            with_error(frame.centre_pct, frame.centre_noise_pct),
+        ]
+        for frame in report.evaluation.frames
     ]
 
 

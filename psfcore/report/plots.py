@@ -74,8 +74,7 @@ def curves_png(report: PsfReport) -> bytes:
             low, high = axes.get_ylim()
             axes.set_ylim(low, high + 0.45 * (high - low))  # room for the legend
             legend(axes, 7.5, ncols=2)
-    tidy(charts)
-    return png_of(figure)
+    return _png(figure, charts)
 
 
 def _draw_curve(axes: Any, report: PsfReport, name: str, title: str) -> None:
@@ -176,8 +175,7 @@ def profile_png(report: PsfReport) -> bytes:
     axes.set(yscale="log", ylim=(min(lowest) / 5, 2), ylabel="Mean weight (fraction of the light per pixel)")
     along_distance(axes, max(report.transit.shape), "Distance from the centre (px)")
     legend(axes)
-    tidy([axes])
-    return png_of(figure)
+    return _png(figure, [axes])
 
 
 def weights_png(report: PsfReport, shells: ShellBands) -> bytes:
@@ -192,8 +190,7 @@ def weights_png(report: PsfReport, shells: ShellBands) -> bytes:
     axes.set_ylabel("Diffuse weight (fraction of the light per pixel)")
     along_distance(axes, field_px)
     legend(axes)
-    tidy([axes])
-    return png_of(figure)
+    return _png(figure, [axes])
 
 
 def totals_png(cross: CrossValidated, fit: TransitFit) -> bytes:
@@ -205,8 +202,7 @@ def totals_png(cross: CrossValidated, fit: TransitFit) -> bytes:
     draw_totals(axes, cross.bands.totals, _BAND)
     axes.axvline(total, color=_COLOURS[SCATTER], linewidth=1.6, label="fit to all images")
     legend(axes, loc="best")
-    tidy([axes])
-    return png_of(figure)
+    return _png(figure, [axes])
 
 
 def slices_png(evaluation: Evaluation) -> bytes:
@@ -220,8 +216,7 @@ def slices_png(evaluation: Evaluation) -> bytes:
         boxed_legend(axes, 7, "upper center")
     for axes in charts[len(shown) :]:
         axes.set_visible(False)
-    tidy(charts)
-    return png_of(figure)
+    return _png(figure, charts)
 
 
 def maps_png(maps: Superposed) -> bytes:
@@ -245,8 +240,7 @@ def residuals_png(evaluation: Evaluation) -> bytes:
     labelled = charts[0].get_legend_handles_labels()
     style: dict[str, Any] = {"ncols": 8, "fontsize": 9, "frameon": False}
     figure.legend(*labelled, title="pointing", loc="outside upper center", **style)
-    tidy(charts)
-    return png_of(figure)
+    return _png(figure, charts)
 
 
 def intensities_png(evaluation: Evaluation) -> bytes:
@@ -254,8 +248,7 @@ def intensities_png(evaluation: Evaluation) -> bytes:
     figure, charts = _figure(WIDTH_IN, 3.9, 2)
     draw_centres(charts[0], evaluation.frames)
     draw_absolute(charts[1], evaluation.frames)
-    tidy(charts)
-    return png_of(figure)
+    return _png(figure, charts)
 
 
 def offsets_png(study: DarkOffsetStudy) -> bytes:
@@ -265,6 +258,10 @@ def offsets_png(study: DarkOffsetStudy) -> bytes:
     for axes, title in zip(charts, ("Diffuse weights", "1 - encircled energy"), strict=True):
         axes.set_title(title)
         boxed_legend(axes, 7.5)
+    return _png(figure, charts)
+
+
+def _png(figure: Any, charts: list[Any]) -> bytes:
     tidy(charts)
     return png_of(figure)
 

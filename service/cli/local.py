@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -54,15 +54,12 @@ from workers.contract.requests import (
     ResolvedDeconvolve,
 )
 from workers.contract.suggestions import explained
-from workers.intake.costs import COSTS, linear_s
+from workers.intake.costs import job_s
 from workers.machine import cores
 from workers.rows import no_such
 from workers.settings import Settings
 from workers.stage_timer import StageTimer
 from workers.versions import name_of_upload
-
-if TYPE_CHECKING:
-    pass
 
 COMPILING = "compiling kernels (only once)"
 _NOW = "now"  # the context that a service without contexts has too
@@ -176,7 +173,7 @@ class Local(Operations):
         if KINDS[kind].counted_whole or getattr(request, "transit_id", None) not in self.inputs.transits:
             return None
         pixels = self.inputs.transits[request.transit_id].contents.pixels
-        return linear_s(kind, request.model_dump(), pixels) / cores() ** COSTS.threads_exponent
+        return job_s(kind, request.model_dump(), pixels) / cores()
 
     def get(self, address: str) -> dict[str, Any]:
         """The description of a result."""

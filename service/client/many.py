@@ -23,7 +23,7 @@ from psfcore.errors import DataError, HeaderError
 from psfcore.files import fits_in
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.cards import optional_text
-from psfcore.fits.header import all_hdus, first_image_header
+from psfcore.fits.header import all_hdus, read_first_image
 from service.client.errors import Answer, Patience, ServiceError, WaitInterrupted
 from service.client.operations import Operations, deconvolution
 from service.client.outputs import check_output_folder, check_outputs
@@ -204,7 +204,7 @@ def _products_in(folder: Path) -> _Products:
     for path in fits_in(folder):
         try:
             all_hdus(path, limits)
-            header = first_image_header(path, limits)
+            header = read_first_image(path, limits)[1].header
         except (HeaderError, OSError):
             continue  # not a complete FITS file, so not a product that can be used in place of a new one
         product_id, sha256 = optional_text(header, "PRODID"), optional_text(header, "INPSHA")

@@ -33,8 +33,8 @@ from psfcore.scatter import power_law
 from psfcore.transit.manifest import parse_manifest
 from tests.fuzz.fits_inputs import compressed_image, plain_image
 from tests.fuzz.text_inputs import instrument, manifest
-from workers.intake.costs import COSTS
-from workers.intake.estimates import _build
+from workers.intake.costs import WORKER_MIB
+from workers.intake.estimates import estimate_build
 from workers.run.child import Child
 
 LIMITS = FitsLimits(max_pixels=128 * 128, max_header_bytes=64 * 1024, max_hdus=8)
@@ -90,7 +90,7 @@ def _instrument_mib(content: bytes) -> float:
     text = content.decode("utf-8", "replace")
     try:
         check_workload(parse_instrument(text, "fuzz.toml"), "fuzz.toml")
-        return float(_build({"instrument_file": text, "size": SIZE_PX})[1])
+        return float(estimate_build({"instrument_file": text, "size": SIZE_PX})[1])
     except DataError:
         return 0.0
 
@@ -124,7 +124,7 @@ def main(counts: dict[str, int], folder: Path) -> None:
     for kind, seed in ((kind, seed) for kind, count in counts.items() for seed in range(count)):
         make, read = KINDS[kind]
         content = make(seed)
-        estimate_mib = COSTS.worker_mib + (_instrument_mib(content) if kind == "instruments" else 0.0)
+        estimate_mib = WORKER_MIB + (_instrument_mib(content) if kind == "instruments" else 0.0)
         try:
             with child.limited(round(estimate_mib)):
                 outcome = read(content, folder)

@@ -147,7 +147,12 @@ def test_the_wheel_holds_the_packages_and_their_files_and_stays_small(wheel: Pat
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
     assert {name.split("/")[0] for name in names if ".dist-info" not in name} == OURS
-    for name in ("heliopsf/py.typed", "psfcore/instruments/hri_euv.toml", "psfcore/drawing/page.html"):
+    for name in (
+        "heliopsf/py.typed",
+        "psfcore/instruments/hri_euv.toml",
+        "psfcore/published_psfs.toml",
+        "psfcore/drawing/page.html",
+    ):
         assert name in names
     kept = {f"{path.relative_to(REPOSITORY)}" for path in (REPOSITORY / "service" / "pages").rglob("*.html")}
     assert kept and kept <= names

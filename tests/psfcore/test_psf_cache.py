@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
+import json
 import os
 from pathlib import Path
 
@@ -10,101 +10,123 @@ import pytest
 
 from psfcore import psf_cache as cache_module
 from psfcore.errors import DataError
-from psfcore.psf_cache import PsfCache
+from psfcore.fits.psfs import write_psf
+from psfcore.psf_cache import FITS, PROVENANCE, PsfCache
+from tests.psfcore.conftest import gaussian, make_psf
 
 ONE, OTHER, THIRD = "1" * 64, "2" * 64, "3" * 64
 
 
 @pytest.fixture
-def cache(tmp_path: Path) -> PsfCache:
-    return PsfCache(tmp_path / "below" / "psfs", 1000)
+def file(tmp_path: Path) -> Path:
+    """A PSF file with a component."""
+    write_psf(tmp_path / "psf.fits", make_psf(gaussian(8, 1.0), components={"SCATTER": gaussian(8, 2.0)}))
+    return tmp_path / "psf.fits"
 
 
-def keep(
-    cache: PsfCache, identity: str, content: bytes, part: str = "fits", used_at: int | None = None
-) -> None:
-    kept = cache.keep(identity, part, lambda path: path.write_bytes(content))
-    assert kept is not None and kept.read_bytes() == content
+@pytest.fixture
+def cache(tmp_path: Path, file: Path) -> PsfCache:
+    """A cache for two files and a half."""
+    return PsfCache(tmp_path / "below" / "psfs", file.stat().st_size * 5 // 2)
+
+
+def keep(cache: PsfCache, identity: str, file: Path, used_at: int | None = None) -> None:
+    cache.keep(identity, FITS, file)
+    kept = cache.folder / f"{identity}.fits"
+    assert kept.read_bytes() == file.read_bytes()
     if used_at is not None:
         os.utime(kept, (used_at, used_at))
 
 
-def test_a_kept_file_is_found_with_its_hash(cache: PsfCache) -> None:
-    assert cache.find(ONE, "fits") is None
-    keep(cache, ONE, b"weights")
-    keep(cache, ONE, b"{}", part="row.json")
-    found = cache.find(ONE, "fits")
-    assert found is not None and found.read_bytes() == b"weights"
-    assert hashlib.sha256(b"weights").hexdigest() in found.name
-    assert cache.find(OTHER, "fits") is None and cache.find(ONE, "preview.png") is None
+def test_a_kept_file_is_found_with_what_is_known_of_it(cache: PsfCache, file: Path, tmp_path: Path) -> None:
+    assert cache.find(ONE) is None
+    keep(cache, ONE, file)
+    found = cache.find(ONE)
+    assert found is not None and found.read_bytes() == file.read_bytes()
+    assert cache.find(OTHER) is None and cache.provenance(ONE) == {}
+    about = tmp_path / "about.json"
+    about.write_text(json.dumps({"psf_id": ONE}))
+    cache.keep(ONE, PROVENANCE, about)
+    assert cache.provenance(ONE) == {"psf_id": ONE}
     (psf,) = cache.psfs()
-    assert psf.identity == ONE and psf.bytes == 9 and len(psf.files) == 2
+    sizes = file.stat().st_size + about.stat().st_size
+    assert (psf.identity, psf.bytes, len(psf.files)) == (ONE, sizes, 2)
+    (cache.folder / f"{ONE}.json").write_text("{")
+    assert cache.provenance(ONE) == {}
 
 
-def test_a_damaged_file_is_removed_and_not_used(cache: PsfCache) -> None:
-    keep(cache, ONE, b"weights")
-    (file,) = cache.folder.iterdir()
-    file.write_bytes(b"Weights")
-    assert cache.find(ONE, "fits") is None
-    assert list(cache.folder.iterdir()) == []
+def test_a_damaged_file_is_removed_and_not_used(cache: PsfCache, file: Path) -> None:
+    content = file.read_bytes()
+    flipped = [
+        content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :] for at in range(5, len(content), 997)
+    ]
+    for damaged in (*flipped, content[:-2880], content[:-1], content + b"x", b"", bytes(len(content))):
+        keep(cache, ONE, file)
+        (cache.folder / f"{ONE}.fits").write_bytes(damaged)
+        assert cache.find(ONE) is None
+        assert list(cache.folder.iterdir()) == []
 
 
 def test_folder_and_files_are_those_of_one_user_alone(
-    cache: PsfCache, monkeypatch: pytest.MonkeyPatch
+    cache: PsfCache, file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cache.folder.mkdir(parents=True)
     cache.folder.chmod(0o755)
     umask = os.umask(0)
     try:
-        keep(cache, ONE, b"weights")
+        keep(cache, ONE, file)
     finally:
         os.umask(umask)
-    (file,) = cache.folder.iterdir()
+    (kept,) = cache.folder.iterdir()
     assert cache.folder.stat().st_mode & 0o777 == 0o700
-    assert file.stat().st_mode & 0o777 == 0o600
-    keep(cache, ONE, b"weights")
+    assert kept.stat().st_mode & 0o777 == 0o600
+    keep(cache, ONE, file)
     monkeypatch.setattr(cache_module.os, "geteuid", lambda: cache.folder.stat().st_uid + 1)
-    assert cache.find(ONE, "fits") is None and cache.psfs() == [] and cache.clear() == 0
+    assert cache.find(ONE) is None and cache.psfs() == [] and cache.clear() == 0
     with pytest.raises(DataError, match="cache-of-another-user"):
-        keep(cache, OTHER, b"weights")
+        keep(cache, OTHER, file)
 
 
-def test_the_psf_that_was_not_used_for_the_longest_time_makes_room(cache: PsfCache) -> None:
-    keep(cache, ONE, bytes(400), used_at=100)
-    keep(cache, OTHER, bytes(401), used_at=200)
-    cache.find(ONE, "fits")  # now ONE was used last
-    keep(cache, THIRD, bytes(402))
+def test_the_psf_that_was_not_used_for_the_longest_time_makes_room(cache: PsfCache, file: Path) -> None:
+    keep(cache, ONE, file, used_at=100)
+    keep(cache, OTHER, file, used_at=200)
+    cache.find(ONE)  # now ONE was used last
+    keep(cache, THIRD, file)
     assert {psf.identity for psf in cache.psfs()} == {ONE, THIRD}
 
 
-def test_the_last_psf_stays_and_a_file_that_is_too_large_is_not_kept(cache: PsfCache) -> None:
-    keep(cache, ONE, bytes(600))
-    keep(cache, ONE, bytes(500), part="tables.json")
+def test_the_last_psf_stays_and_a_file_that_is_too_large_is_not_kept(cache: PsfCache, file: Path) -> None:
+    for part in (FITS, "total.fits", "other.fits"):
+        cache.keep(ONE, part, file)
     assert [psf.identity for psf in cache.psfs()] == [ONE]
-    assert cache.keep(OTHER, "fits", lambda path: path.write_bytes(bytes(1001))) is None
-    assert PsfCache(cache.folder, 0).keep(OTHER, "fits", lambda path: None) is None
+    PsfCache(cache.folder, file.stat().st_size - 1).keep(OTHER, FITS, file)
+    PsfCache(cache.folder, 0).keep(OTHER, FITS, file)
     assert {path.name[:64] for path in cache.folder.iterdir()} == {ONE}
 
 
-def test_failed_writes_and_killed_processes_leave_nothing(cache: PsfCache) -> None:
-    def half(path: Path) -> None:
-        path.write_bytes(b"half")
+def test_failed_writes_and_killed_processes_leave_nothing(
+    cache: PsfCache, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def half(_: Path, unfinished: Path) -> None:
+        unfinished.write_bytes(b"half")
         raise InterruptedError
 
-    with pytest.raises(InterruptedError):
-        cache.keep(ONE, "fits", half)
+    with monkeypatch.context() as patched, pytest.raises(InterruptedError):
+        patched.setattr(cache_module.shutil, "copyfile", half)
+        cache.keep(ONE, FITS, file)
     assert list(cache.folder.iterdir()) == []
     for name, changed_at in ((".old.part", 0), (".new.part", None)):
         (cache.folder / name).write_bytes(b"half")
         if changed_at is not None:
             os.utime(cache.folder / name, (changed_at, changed_at))
-    keep(cache, ONE, b"weights")
+    keep(cache, ONE, file)
     assert not (cache.folder / ".old.part").exists() and (cache.folder / ".new.part").exists()
 
 
-def test_clear_removes_the_psfs_and_leaves_other_files(cache: PsfCache) -> None:
-    keep(cache, ONE, b"weights")
-    keep(cache, OTHER, b"weights")
-    (cache.folder / "notes.txt").write_text("mine")
-    assert cache.clear() == 14
+def test_clear_removes_the_psfs_and_leaves_other_files(cache: PsfCache, file: Path) -> None:
+    keep(cache, ONE, file)
+    keep(cache, OTHER, file)
+    for name in ("notes.txt", ".new.part"):
+        (cache.folder / name).write_text("mine")
+    assert cache.clear() == 2 * file.stat().st_size
     assert [path.name for path in cache.folder.iterdir()] == ["notes.txt"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from http.server import BaseHTTPRequestHandler
@@ -58,7 +59,8 @@ def test_a_broken_download_is_resumed_if_the_server_has_the_same_file(tmp_path: 
             server.broken = 2  # both tries of the first download
             with pytest.raises(DataError, match="psf-not-downloaded"):
                 get(folder, NAME)
-            kept = (folder / f"{NAME}.part").stat().st_size
+            (part,) = folder.glob(f"{NAME}.*.part")
+            kept = part.stat().st_size
             assert 0 < kept < whole and server.sent[0] == whole > server.sent[1]
             server.files["/psf"] = server.published = again
             psf = read_psf(get(folder, NAME), LIMITS)
@@ -104,8 +106,9 @@ def no_json(request: BaseHTTPRequestHandler) -> None:
     answer(request, 200, b"<html>sign in</html>")
 
 
-def unknown_checksum(request: BaseHTTPRequestHandler) -> None:
-    answer(request, 200, b'{"data": {"dataFile": {"checksum": {"type": "CRC", "value": "0"}}}}')
+def tells(algorithm: str, value: str) -> Fault:
+    checksum = {"data": {"dataFile": {"checksum": {"type": algorithm, "value": value}}}}
+    return lambda request: answer(request, 200, json.dumps(checksum).encode())
 
 
 def to(address: str) -> Fault:
@@ -121,7 +124,8 @@ def to(address: str) -> Fault:
         ("/psf", sends_much, "more than twice as much"),
         ("/psf", to("/psf"), "at most 5 redirections"),
         (CHECKSUM, no_json, "expected the checksum of psf_aia_193.fits"),
-        (CHECKSUM, unknown_checksum, "expected the checksum of psf_aia_193.fits"),
+        (CHECKSUM, tells("CRC", "00"), "expected the checksum of psf_aia_193.fits"),
+        (CHECKSUM, tells("MD5", "/../../x"), "expected the checksum of psf_aia_193.fits"),
         (CHECKSUM, lambda request: request.send_error(503), "503"),
     ],
 )
@@ -148,12 +152,9 @@ def test_redirections_stay_at_the_servers_of_the_repository(tmp_path: Path, path
             ):
                 get(tmp_path, NAME)
         assert other.asked == []
-        server.faults = {"/psf": to("/file"), CHECKSUM: to(server.address + "/told")}
+        told = tells("SHA-256", hashlib.sha256(published_fits()).hexdigest())
+        server.faults = {"/psf": to("/file"), CHECKSUM: to(server.address + "/told"), "/told": told}
         server.files["/file"] = published_fits()
-        told = hashlib.sha256(published_fits()).hexdigest()
-        server.files["/told"] = (
-            b'{"data": {"dataFile": {"checksum": {"type": "SHA-256", "value": "%s"}}}}' % told.encode()
-        )
         assert get(tmp_path, NAME).is_file()
 
 

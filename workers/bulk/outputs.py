@@ -11,7 +11,7 @@ from typing import Any
 
 from psfcore.errors import DataError
 from psfcore.files import sha256_of
-from psfcore.fits.header import FitsLimits, first_image_header, optional_text
+from psfcore.fits.header import FitsLimits, optional_text, read_first_image
 from workers.contract.bulk import MOST_IN_PATH, FieldValue, Output, laid_out
 from workers.files import archive as archive_files
 from workers.files.store import is_disk_full
@@ -71,7 +71,7 @@ def prepare(output: Output, target: Path, identity: str, settings: Settings, lim
     """
     if output.layout is not None and target.is_file():
         try:
-            there = optional_text(first_image_header(target, limits), "PRODID")
+            there = optional_text(read_first_image(target, limits)[1].header, "PRODID")
         except DataError:  # a file that is no product; it must not be replaced either
             there = None
         if there != identity:

@@ -29,7 +29,7 @@ from psfcore.errors import DataError
 from psfcore.files import FITS_ENDING, PARTIAL
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.cards import optional_value
-from psfcore.fits.header import first_image_header
+from psfcore.fits.header import read_first_image
 from workers.contract.bulk import Condition
 from workers.files.modes import open_file, open_folder, open_made_folder
 
@@ -107,7 +107,7 @@ def find(glob: str, allowed: Sequence[Path], after: Place | None = None) -> Iter
 
 def matches(path: Path, where: dict[str, Condition], limits: FitsLimits) -> bool:
     """Whether the header of a file's first image meets all conditions. Raises DataError if it cannot be read."""
-    header = first_image_header(path, limits)
+    header = read_first_image(path, limits)[1].header
     return all(_met(optional_value(header, key), condition) for key, condition in where.items())
 
 

@@ -1,118 +1,50 @@
-"""What jobs cost: the models of ``estimates.json``, which need no catalogue.
+"""What jobs cost: figures that were measured, which need no catalogue.
 
-``python -m benchmarks.estimates --write`` measured the values. Times in seconds are processor time on one core of a machine of 2026.
-Times per pixel are in ns, memory per pixel in bytes.
+`python -m benchmarks.estimates` prints the measured times and memory beside the estimates. Times in seconds are processor time on one
+core of a machine of 2026. A time here may be wrong by a factor of two: `workers.intake.estimates` multiplies it by a factor that
+the service measures. The memory is an upper bound.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib.resources import files
+from dataclasses import dataclass, field
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
 
+@dataclass(frozen=True)
+class Cost:
+    """Time (s, and ns for each pixel that the job reads) and memory (MiB, and bytes for each pixel) of a kind of job.
 
-class _Frozen(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class Linear(_Frozen):
-    """Time and memory as a constant plus a part that is proportional to the number of pixels that the job reads.
-
-    as_published, shapes: if the request sets the parameter of this name, the time is multiplied by this factor.
+    times: factors of the time, by the names of the parameters that cause them if the request sets them. runs: by scheme, what each
+    run adds to the time, as a share of it.
     """
 
     base_s: float
     pixel_ns: float
-    base_mib: float
-    pixel_bytes: float
-    as_published: float = 1.0
-    shapes: float = 1.0
-    run: dict[str, tuple[float, float]] = {}  # time of one run, by scheme: s, and ns per pixel
+    base_mib: float = 0.0
+    pixel_bytes: float = 0.0
+    times: Mapping[str, float] = field(default_factory=dict)
+    runs: Mapping[str, float] = field(default_factory=dict)
 
 
-class Deconvolution(_Frozen):
-    """Time of a deconvolution. The plane is the image with its margins. `psfcore.deconvolve.memory` has the memory.
-
-    step_ns: for each method, the time of one step for one pixel of the plane, ns.
-    """
-
-    base_s: float
-    image_ns: float
-    step_ns: dict[str, float]
-    psf_draws: int  # deconvolutions with other PSFs, for the errors of a fitted PSF: two per parameter
-
-    def of_method(self, name: str) -> float:
-        """The time of a method in ``step_ns``; that of the slowest one if it was not measured yet."""
-        return self.step_ns.get(name, max(self.step_ns.values()))
+WORKER_MIB = 400.0  # of a worker with its libraries, before its first job
+OTHER = Cost(10.0, 2000.0, 200.0, 30.0)  # of kinds without an entry
+COSTS = {
+    "deconvolve": Cost(0.6, 750.0),
+    "psf-tables": Cost(0.3, 200.0, 0.0, 16.0),
+    "psf-interpolate": Cost(1.0, 1050.0, 66.0, 97.0),
+    "psf-fit": Cost(8.3, 2200.0, 485.0, 12.0, times={"as_published": 7.0}),
+    "cross-validate": Cost(2.9, 1600.0, 100.0, 20.0, runs={"shared": 0.08, "exact": 1.4}),
+    "report": Cost(20.0, 10500.0, 505.0, 27.0, times={"shapes": 3.0}),
+    "gap-diagnose": Cost(6.0, 10000.0, 505.0, 100.0),
+}
 
 
-class Build(_Frozen):
-    """The time that a PSF build takes for each spectral line of the bandpass, and the memory that it needs.
-
-    A mask is sampled at S^2 points per pixel. ``psfcore.instruments.workload`` counts the points, cells, windows and
-    entries. Suffix _ns: the time for one point, cell, window or entry; suffix _bytes: the memory for one.
-    """
-
-    disc_s: float
-    mesh_s: float
-    mask_s: float
-    fewest_samples: int  # smallest S
-    samples_exponent: float
-    grid_px: int
-    grid_exponent: float
-    grid_mib: float
-    meshes_mib: float
-    airy_ns: float
-    airy_bytes: float
-    cell_ns: float
-    cell_bytes: float
-    window_ns: float  # for each window and pixel of an edge of the grid
-    outlines: int  # outlines of a mount that ``mask_s`` includes
-    entry_ns: float  # for each further entry of the list of edges, times S
-    entry_bytes: float
-    spectrum_bytes: float  # for each row of the mask and pixel of an edge of the grid
-    image_bytes: float  # for each pixel of a mask image
-
-
-class Costs(_Frozen):
-    """The content of ``estimates.json``.
-
-    threads_exponent: p. With n threads, the time is the time of one thread multiplied by n ** -p.
-    """
-
-    class Kinds(BaseModel):
-        """The models by kind of job. Every kind except ``deconvolve`` and ``psf-build`` is Linear; a kind without an entry uses "other"."""
-
-        model_config = ConfigDict(frozen=True, extra="allow")
-        __pydantic_extra__: dict[str, Linear]
-
-        deconvolve: Deconvolution
-        psf_build: Build = Field(alias="psf-build")
-        other: Linear
-
-    worker_mib: float  # memory of a worker with its libraries, before its first job
-    threads_exponent: float
-    kinds: Kinds
-
-    def linear(self, kind: str) -> Linear:
-        """The linear model of a kind; the model "other" if the kind has no entry."""
-        return (self.kinds.__pydantic_extra__ or {}).get(kind, self.kinds.other)
-
-
-COSTS_FILE = files(__package__).joinpath("estimates.json")
-COSTS = Costs.model_validate_json(COSTS_FILE.read_text("utf-8"))
-
-
-def linear_s(kind: str, parameters: Mapping[str, Any], pixels: float) -> float:
-    """The estimated processor time of a job that reads this number of pixels, s. kind: one with a linear model."""
-    cost = COSTS.linear(kind)
+def job_s(kind: str, parameters: Mapping[str, Any], pixels: float) -> float:
+    """The estimated processor time of a job that reads this number of pixels, s; without the steps of a deconvolution."""
+    cost = COSTS.get(kind, OTHER)
     cpu_s = cost.base_s + cost.pixel_ns * 1e-9 * pixels
-    for parameter, times in (("as_published", cost.as_published), ("shapes", cost.shapes)):
-        if parameters.get(parameter):
-            cpu_s *= times
-    if parameters.get("scheme") in cost.run:
-        run_s, run_ns = cost.run[parameters["scheme"]]
-        cpu_s += parameters["runs"] * (run_s + run_ns * 1e-9 * pixels)
-    return cpu_s
+    for parameter, factor in cost.times.items():
+        cpu_s *= factor if parameters.get(parameter) else 1.0
+    return cpu_s * (1 + cost.runs.get(parameters.get("scheme", ""), 0.0) * parameters.get("runs", 0))

@@ -1,8 +1,8 @@
 """Estimates the time and memory of a job from the sizes of its inputs, before the job is accepted.
 
-The initial values are those of ``costs``. The time is then multiplied by a factor that was measured in this catalogue: on the
-completed jobs of the same kind that were of the most similar size, and for the images of a bulk run on the images of the newest
-run. A wrong estimate does little harm, because a job that takes too long is stopped, and no memory is reserved.
+The time is a constant and a time for each pixel, and of a deconvolution for each step. It is multiplied by a factor that was measured
+in this catalogue: on the completed jobs of the same kind that were of the most similar size, and for the images of a bulk run on
+the images of the newest run. A wrong estimate does little harm, because a job that takes too long is stopped, and no memory is reserved.
 
 | symbol | name | unit |
 |---|---|---|
@@ -25,12 +25,13 @@ from psfcore.deconvolve.memory import EXPECTED_RIM_PX, MIB, Demand, product_byte
 from psfcore.errors import DataError
 from psfcore.instruments.model import parse_instrument
 from psfcore.instruments.workload import workload
+from psfcore.recipe import REACH_GRID_PX
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ImageRow, PsfRow, TransitRow
 from workers.contract.identities import instrument_text
 from workers.contract.kinds import KINDS
 from workers.contract.requests import PsfBuild
-from workers.intake.costs import COSTS, linear_s
+from workers.intake.costs import COSTS, OTHER, WORKER_MIB, job_s
 from workers.settings import Settings
 
 # The factor is the median of the NEAREST jobs or images, by the estimated time, of the newest MOST_JOBS. Of short jobs
@@ -43,6 +44,17 @@ BULK = "bulk-image"  # takes the place of a kind for the images of bulk runs
 # computed nothing. Such jobs are left out.
 FOUND = 0.05
 KEEP_FACTOR_S = 60.0
+# A deconvolution: ns for each pixel of the plane and step; and the deconvolutions with other PSFs, two for each parameter of a fitted
+# PSF, that its errors need.
+STEP_NS, PSF_DRAWS = 27.0, 8
+# A PSF build: the time for each spectral line and for each of its meshes on the grid of REACH_GRID_PX, s; ns for each point of the analytic
+# pattern, and for each cell of a mask and each of its outlines. The transform of a mask takes as long as LEAST_OUTLINES.
+LINE_S, MESH_S, POINT_NS, OUTLINE_NS = 1.0, 3.5, 520.0, 1.15
+LEAST_CELLS, LEAST_OUTLINES = 28_674, 16
+# Its memory, MiB: of the grid, and of the patterns of meshes and masks; bytes: for each point, for each cell of a rotated mesh, for each
+# edge in a row of the mask, for each row of the mask and pixel of an edge of the grid, and for each pixel of a mask image.
+GRID_MIB, MESHES_MIB = 500.0, 350.0
+POINT_BYTES, CELL_BYTES, ENTRY_BYTES, SPECTRUM_BYTES, IMAGE_BYTES = 120.0, 400.0, 8.0, 8.0, 32.0
 _times: WeakKeyDictionary[Catalogue, dict[str, tuple[list[tuple[float, float]], float]]] = WeakKeyDictionary()
 
 
@@ -88,12 +100,12 @@ def estimate(
     if kind == "deconvolve":
         cpu_s, mib = _deconvolution(parameters, catalogue, owner)
     elif kind == "psf-build":
-        cpu_s, mib = _build(parameters, catalogue, owner)
+        cpu_s, mib = estimate_build(parameters, catalogue, owner)
     else:
         cpu_s, mib = _linear(kind, parameters, catalogue, owner)
-    start_s = cpu_s / threads**COSTS.threads_exponent
+    start_s = cpu_s / threads
     return Estimate(
-        memory_mib=round(COSTS.worker_mib + mib),
+        memory_mib=round(WORKER_MIB + mib),
         seconds=round(start_s * factor(kind, start_s, catalogue), 1),
         start_s=round(start_s, 3),
     )
@@ -121,7 +133,6 @@ def factor(kind: str, start_s: float, catalogue: Catalogue) -> float:
 
 
 def _deconvolution(parameters: Mapping[str, Any], catalogue: Catalogue, owner: str) -> tuple[float, float]:
-    cost = COSTS.kinds.deconvolve
     image = catalogue.get(ImageRow, parameters["image_id"], owner)
     psf = catalogue.get(PsfRow, parameters["psf_id"], owner)
     # An image of a bulk run may be a file that was not uploaded; the parameters then contain its shape.
@@ -136,7 +147,7 @@ def _deconvolution(parameters: Mapping[str, Any], catalogue: Catalogue, owner: s
         psf_shape = psf_shape if psf is None else tuple(psf.details["shape"])
     elif parameters.get("psf_recipe") is not None:  # the PSF may still have to be built
         recipe = parameters["psf_recipe"]
-        built_s, built_mib = _build(recipe, catalogue, owner)
+        built_s, built_mib = estimate_build(recipe, catalogue, owner)
         psf_shape = (recipe["size"], recipe["size"])
     method, draws = parameters["method"], parameters["error_draws"]
     whole_px = ny * nx
@@ -153,55 +164,51 @@ def _deconvolution(parameters: Mapping[str, Any], catalogue: Catalogue, owner: s
     plane = math.prod(asked.plane)
     interpolated = parameters.get("psf_interpolation") is not None
     fitted = interpolated or (psf is not None and "fit" in psf.details)
-    runs = 1 + draws + (cost.psf_draws if draws and fitted else 0)
-    cpu_s = built_s + cost.base_s + cost.image_ns * 1e-9 * ny * nx
-    cpu_s += runs * method["steps"] * cost.of_method(method["name"]) * 1e-9 * plane
+    runs = 1 + draws + (PSF_DRAWS if draws and fitted else 0)
+    cpu_s = built_s + job_s("deconvolve", parameters, ny * nx)
+    cpu_s += runs * method["steps"] * STEP_NS * 1e-9 * plane
     return cpu_s, max(built_mib, product_bytes(asked, whole_px) / MIB)
 
 
-def _build(
+def estimate_build(
     parameters: Mapping[str, Any], catalogue: Catalogue | None = None, owner: str = ""
 ) -> tuple[float, float]:
-    cost = COSTS.kinds.psf_build
-    size = max(parameters["size"], cost.grid_px)
-    grid = size / cost.grid_px
+    """The processor time, s, and the memory, MiB, of a PSF build. catalogue: of the mask image; None: the build has none."""
+    size = max(parameters["size"], REACH_GRID_PX)
+    grid = size / REACH_GRID_PX
     if not (parameters.get("instrument") or parameters.get("instrument_file")):
         # This is a rerun. The text of the instrument file is in the file of the PSF, which is not read here.
-        return cost.mask_s, cost.meshes_mib + cost.grid_mib * grid**2
+        return OUTLINE_NS * 1e-9 * LEAST_OUTLINES * LEAST_CELLS**2, MESHES_MIB + GRID_MIB * grid**2
     build = PsfBuild.model_validate(parameters)
     instrument = parse_instrument(instrument_text(build), build.instrument or "instrument_file")
     work = workload(instrument, size)
-    line_s = cost.disc_s + cost.mesh_s * len(instrument.meshes)
+    line_s = LINE_S + MESH_S * len(instrument.meshes)
     if work.mask:
-        samples = max(cost.fewest_samples, work.samples)
-        line_s += cost.mask_s * (samples / cost.fewest_samples) ** cost.samples_exponent
-        further = max(0, work.mount_entries - cost.outlines * work.mask_cells)
+        cells = max(work.mask_cells, LEAST_CELLS)
         masks = 2 if instrument.meshes else 1  # the mount alone, and with the meshes
-        line_s += masks * cost.entry_ns * 1e-9 * further * samples
-    line_s *= grid**cost.grid_exponent
-    line_s += 1e-9 * (cost.airy_ns * work.airy_points + cost.cell_ns * sum(work.cells))
-    line_s += 1e-9 * cost.window_ns * sum(work.windows) * size
-    meshes_mib = cost.meshes_mib if work.mask or instrument.meshes else 0.0
+        line_s += masks * OUTLINE_NS * 1e-9 * cells * max(work.mount_entries, LEAST_OUTLINES * cells)
+    line_s = line_s * grid + POINT_NS * 1e-9 * work.airy_points
+    meshes_mib = MESHES_MIB if work.mask or instrument.meshes else 0.0
     # Meshes, the analytic pattern and the mask are computed one after the other.
     arrays = max(
-        cost.airy_bytes * work.airy_points,
-        cost.cell_bytes * max(work.cells, default=0),
-        cost.entry_bytes * work.mount_entries + cost.spectrum_bytes * work.mask_cells * size,
+        POINT_BYTES * work.airy_points,
+        CELL_BYTES * max(work.cells, default=0),
+        ENTRY_BYTES * work.mount_entries + SPECTRUM_BYTES * work.mask_cells * size,
     )
     mask = None if catalogue is None else catalogue.get(ImageRow, parameters.get("mask_id") or "", owner)
     if mask is not None:
-        arrays += cost.image_bytes * math.prod(mask.summary["shape"])
-    return len(instrument.spectral_lines) * line_s, meshes_mib + cost.grid_mib * grid**2 + arrays / MIB
+        arrays += IMAGE_BYTES * math.prod(mask.summary["shape"])
+    return len(instrument.spectral_lines) * line_s, meshes_mib + GRID_MIB * grid**2 + arrays / MIB
 
 
 def _linear(
     kind: str, parameters: Mapping[str, Any], catalogue: Catalogue, owner: str
 ) -> tuple[float, float]:
-    cost, pixels = COSTS.linear(kind), _pixels(parameters, catalogue, owner)
+    cost, pixels = COSTS.get(kind, OTHER), _pixels(parameters, catalogue, owner)
     built_s, built_mib = 0.0, 0.0
     if parameters.get("diffraction_recipe") is not None:
-        built_s, built_mib = _build(parameters["diffraction_recipe"], catalogue, owner)
-    cpu_s = built_s + linear_s(kind, parameters, pixels)
+        built_s, built_mib = estimate_build(parameters["diffraction_recipe"], catalogue, owner)
+    cpu_s = built_s + job_s(kind, parameters, pixels)
     return cpu_s, max(built_mib, cost.base_mib + cost.pixel_bytes * pixels / MIB)
 
 

@@ -6,7 +6,6 @@ For a file the tables are computed in this process; for an id the service reads 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -15,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from psfcore.psf_cache import PROVENANCE, CachedPsf, PsfCache
 from psfcore.published_psfs import PUBLISHED, get, published
 from psfcore.tables import lookup
 from service.cli.connection import ID_OR_FILE, SERVER_FOR_IDS, is_psf_id, psf_file, remote, short, whole_id
@@ -189,7 +187,8 @@ def list_cached() -> None:
         psfs = folder.psfs()
         for psf in psfs:
             used = datetime.fromtimestamp(psf.used_at, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
-            echo(f"{short(psf.identity)}  {psf.bytes / _MIB:8.1f} MiB  {used}  {_named(folder, psf)}")
+            name = _named(folder.provenance(psf.identity))
+            echo(f"{short(psf.identity)}  {psf.bytes / _MIB:8.1f} MiB  {used}  {name}")
     total = sum(psf.bytes for psf in psfs) / _MIB
     echo(f"{len(psfs)} PSFs, {total:.1f} of {folder.max_bytes // _MIB} MiB, in {folder.folder}")
 
@@ -203,12 +202,11 @@ def clear() -> None:
     echo(f"removed {count} PSFs, {removed / _MIB:.1f} MiB, from {folder.folder}")
 
 
-def _named(folder: PsfCache, psf: CachedPsf) -> str:
+def _named(provenance: dict[str, Any]) -> str:
     """The instrument, the size and the component of a PSF, from its provenance."""
-    file = folder.find(psf.identity, PROVENANCE)
-    if file is None:
+    if not provenance:
         return "(incomplete)"
-    parameters: dict[str, Any] = json.loads(file.read_bytes())["parameters"]
+    parameters: dict[str, Any] = provenance["parameters"]
     parts = [parameters.get("instrument", "your instrument file"), f"{parameters['size']} px"]
     return ", ".join([*parts, *filter(None, [parameters.get("component")])])
 

@@ -15,8 +15,8 @@ from psfcore.instruments.files import instrument_names
 from psfcore.instruments.model import MOST_BYTES, load_instrument, parse_instrument
 from psfcore.instruments.workload import MOST_CELLS, MOST_SAMPLES, PERIOD_PX, check_workload, workload
 from tests.conftest import REPOSITORY, SMALL_INSTRUMENT
-from workers.intake.costs import COSTS
-from workers.intake.estimates import _build
+from workers.intake.costs import WORKER_MIB
+from workers.intake.estimates import estimate_build
 
 MIB = 2**20
 MESH = "[[meshes]]\nname = 'm'\nplace = 'entrance'\npitch_um = 300.0\nwire_um = 30.0\n"
@@ -106,7 +106,7 @@ def test_a_greedy_file_within_the_limits_keeps_to_its_estimate() -> None:
     instrument = parse_instrument(GREEDY, "greedy.toml")
     check_workload(instrument, "greedy.toml")
     assert max(workload(instrument, SIZE_PX).cells) > 200_000
-    estimate_mib = round(COSTS.worker_mib + _build({"instrument_file": GREEDY, "size": SIZE_PX})[1])
+    estimate_mib = round(WORKER_MIB + estimate_build({"instrument_file": GREEDY, "size": SIZE_PX})[1])
     command = [sys.executable, "-c", BUILD, str(estimate_mib), str(SIZE_PX)]
     done = subprocess.run(command, input=GREEDY, cwd=REPOSITORY, capture_output=True, text=True, timeout=170)
     assert done.stdout == f"({SIZE_PX}, {SIZE_PX})\n", done.stderr

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import re
 import uuid
-from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
 from typing import Any
@@ -13,8 +12,6 @@ from typing import Any
 import pytest
 from sqlalchemy import delete
 
-from psfcore.deconvolve.methods import linear
-from psfcore.deconvolve.methods.registry import method_names, properties_of
 from psfcore.errors import DataError
 from psfcore.instruments.model import parse_instrument
 from psfcore.instruments.workload import check_workload
@@ -27,7 +24,6 @@ from workers.catalogue.tables import ImageRow, JobRow, TransitRow
 from workers.contract.jobs import Phase
 from workers.contract.requests import METHOD_MODELS, PsfBuild
 from workers.intake import estimates
-from workers.intake.costs import COSTS
 from workers.intake.estimates import BOUNDS, FEWEST_JOBS, KEEP_FACTOR_S, checked, estimate
 from workers.settings import Settings
 
@@ -58,21 +54,6 @@ def needs(
     return found.seconds, found.memory_mib
 
 
-def test_the_figures_are_those_of_known_methods() -> None:
-    assert set(COSTS.kinds.deconvolve.step_ns) == set(method_names())
-
-
-def test_a_method_without_figures_is_slow(catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
-    slowest = deconvolution(catalogue, method={"name": "richardson-lucy-total-variation", "steps": 20})
-    expected = needs(catalogue, "deconvolve", slowest)
-    like = properties_of("richardson-lucy-total-variation")
-    figures = {name: getattr(like, name) for name in ("margin_of_psf", "plane_bytes", "transform_bytes")}
-    monkeypatch.setattr(linear, "METHOD", replace(linear.METHOD, **figures))
-    monkeypatch.delitem(COSTS.kinds.deconvolve.step_ns, "linear")
-    unknown = deconvolution(catalogue, method={"name": "linear", "steps": 20})
-    assert needs(catalogue, "deconvolve", unknown) == expected
-
-
 def test_more_to_do_needs_more(catalogue: Catalogue) -> None:
     base = needs(catalogue, "deconvolve", deconvolution(catalogue))
     bigger = needs(catalogue, "deconvolve", deconvolution(catalogue, 4096))
@@ -88,7 +69,7 @@ def test_more_to_do_needs_more(catalogue: Catalogue) -> None:
     )
     assert none[0] <= base[0] and none[1] < base[1]
     threads = needs(catalogue, "deconvolve", deconvolution(catalogue), threads=4)
-    assert base[0] / 4 < threads[0] < base[0] / 2 and threads[1] == base[1]
+    assert threads == (pytest.approx(base[0] / 4, abs=0.1), base[1])
 
 
 def test_a_psf_that_may_have_to_be_built_first_counts(catalogue: Catalogue) -> None:
@@ -160,20 +141,18 @@ def test_studies_go_with_the_transit_s_length(catalogue: Catalogue) -> None:
         catalogue.add(
             TransitRow(owner=OWNER, id=name * 64, created_at=0.0, bytes=1, filename=None, summary=summary)
         )
-    for kind, more in {
-        "psf-fit": {"as_published": False},
-        "report": {},
-        "gap-diagnose": {},
-        "cross-validate": {"scheme": "shared", "runs": 10},
-    }.items():
-        small, large = (
-            needs(catalogue, kind, {"transit_id": name * 64, "diffraction_recipe": None, **more})
-            for name in "12"
+    for kind, less, more, factor in (
+        ("psf-fit", {"as_published": False}, {"as_published": True}, 5),
+        ("report", {"shapes": None}, {"shapes": ["king"]}, 2),
+        ("gap-diagnose", {}, {}, 1),
+        ("cross-validate", {"scheme": "shared", "runs": 10}, {"scheme": "exact", "runs": 10}, 5),
+    ):
+        small, large, largest = (
+            needs(catalogue, kind, {"transit_id": name * 64, "diffraction_recipe": None, **asked})
+            for name, asked in (("1", less), ("2", less), ("2", more))
         )
         assert large[0] > 10 * small[0] and large[1] > 3 * small[1]
-    given = {"transit_id": "2" * 64, "runs": 10, "diffraction_recipe": None}
-    shared, exact = (needs(catalogue, "cross-validate", given | {"scheme": s}) for s in ("shared", "exact"))
-    assert exact[0] > 5 * shared[0]
+        assert largest[0] >= factor * large[0] and largest[1] == large[1]
 
 
 def completed(catalogue: Catalogue, count: int, took_s: float, start_s: float = 1.0) -> None:

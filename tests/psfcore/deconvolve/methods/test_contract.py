@@ -9,7 +9,6 @@ from psfcore.deconvolve.conditions import Conditions
 from psfcore.deconvolve.methods.registry import method_named, method_names, properties_of
 from psfcore.simulate.scene import observe, solar_scene
 from tests.psfcore.conftest import gaussian, make_image, make_psf
-from workers.intake.costs import COSTS
 
 STEPS = 3
 LEAST_GAIN = 0.95  # a few steps must bring the estimate nearer to the scene by 5 %
@@ -21,8 +20,6 @@ def faults(name: str) -> list[str]:
     figures = ("margin_of_psf", "plane_bytes", "transform_bytes")
     if any(getattr(properties_of(name), figure) is None for figure in figures):
         told.append(f"{name}: measure {', '.join(figures)}: python -m benchmarks.growth memory")
-    if name not in COSTS.kinds.deconvolve.step_ns:
-        told.append(f"{name}: measure its time: python -m benchmarks.estimates --write")
     if not _approaches(name):
         told.append(
             f"{name}: {STEPS} steps do not bring the estimate nearer to the scene: divide a filter in the layout of "

@@ -20,7 +20,7 @@ from workers.bulk import task as bulk_task
 from workers.bulk.runs import keep_turns
 from workers.catalogue.catalogue import Catalogue
 from workers.files.store import Store
-from workers.intake import estimates
+from workers.intake.costs import COSTS, Cost
 from workers.run import attempt, runner
 from workers.run.runner import Runner
 from workers.settings import Settings
@@ -106,9 +106,7 @@ def test_an_image_over_a_limit_fails_like_a_single_job(
     settings: Settings, tmp_path: Path, psf_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # So slow a machine that the limit parts the images, and no clock does.
-    slow_reading = estimates.COSTS.kinds.deconvolve.model_copy(update={"image_ns": 1e6})
-    slow_kinds = estimates.COSTS.kinds.model_copy(update={"deconvolve": slow_reading})
-    monkeypatch.setattr(estimates, "COSTS", estimates.COSTS.model_copy(update={"kinds": slow_kinds}))
+    monkeypatch.setitem(COSTS, "deconvolve", Cost(base_s=0.6, pixel_ns=1e6))
     shapes = {"a": (96, 128), "b": (512, 512)}
     archive = tmp_path / "archive"
     archive.mkdir()
