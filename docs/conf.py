@@ -26,7 +26,7 @@ os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.envir
 project = "heliopsf"
 author = "The heliopsf developers"
 version = release = version_of("heliopsf")
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx_gallery.gen_gallery"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_gallery.gen_gallery"]
 exclude_patterns = ["_build", "tutorials"]
 default_role = "py:obj"  # `name` in docstrings
 myst_heading_anchors = 3
@@ -34,6 +34,9 @@ myst_heading_anchors = 3
 autodoc_typehints = "none"  # the docstrings say what each parameter is
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
+napoleon_google_docstring = False  # public docstrings have the sections of numpydoc
+napoleon_use_ivar = True  # attributes as a list
+napoleon_use_rtype = False  # the type of a result beside its text
 
 html_theme = "pydata_sphinx_theme"
 html_title = f"heliopsf {release}"

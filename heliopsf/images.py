@@ -201,21 +201,34 @@ def deconvolve(
 
 
 def psf_for(image: Any, *, threads: int | None = None, progress: Progress = None) -> Psf:
-    """The PSF for an image, on the pixels of the image. A service without certified PSFs chooses the same PSF.
+    """Find the PSF for an image, on the pixels of the image.
 
-    The first call for a telescope takes up to a minute; the PSF is then kept in a cache (see ``heliopsf cache``).
+    A service without certified PSFs chooses the same PSF. The first call for a telescope takes up to a minute; the PSF
+    is then kept in a cache (see ``heliopsf cache``).
 
     Parameters
     ----------
-    image
+    image : Map, NDData, NDCube, array, (array, header), HDU, HDUList, path, bytes, Image or header
         As for ``deconvolve``, or a header (a ``Header`` of astropy, or a table of cards such as ``Map.meta``).
-    threads, progress : optional
-        As for ``deconvolve``.
+    threads : int, optional
+        Number of threads. Default: all cores.
+    progress : bool, optional
+        True: show a line while the PSF is built.
+
+    Returns
+    -------
+    Psf
+        With its ``kernel`` [y, x] and its ``components``.
 
     Raises
     ------
     DataError
-        "no-psf-for-instrument", "channel-mismatch" or "plate-scale-mismatch".
+        "no-psf-for-instrument", "channel-mismatch" or "plate-scale-mismatch", and the errors of reading a header.
+
+    Warns
+    -----
+    DataWarning
+        With its ``code``, for what may make the PSF wrong for this image.
     """
     with on_disk(image) as image:
         header = header_of(image)

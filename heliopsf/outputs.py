@@ -34,57 +34,147 @@ _REMOVED = re.compile(rf"{STATISTICS}|PSFDOI", re.IGNORECASE)
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Deconvolution(Shown, Product):
-    """A deconvolved image: ``pixels`` [y, x] in the unit of the image, and the inputs, errors and warnings that
-    belong to it.
+    """A deconvolved image with its inputs, errors and warnings.
 
-    image: the input, with its mask. psf: the PSF on the pixels of the image; without components, if it was built for the
-    telescope in the header. errors: planes with the standard deviation of
-    each pixel, if they were asked for. warnings: sentences by their codes.
+    Attributes
+    ----------
+    pixels : ndarray of float64, shape (ny, nx)
+        The deconvolved image [y, x] in the unit of the image. NaN: the image has no finite value there.
+    image : Image
+        The input with its mask and header; the box of it if a region was deconvolved.
+    psf : Psf
+        The PSF on the pixels of the image. It has no components if it was built for the telescope in the header.
+    errors : ErrorPlanes or None
+        Planes with the standard deviation of each pixel. None: not asked for.
+    noise : CameraNoise or None
+        The noise of the camera. None: errors were not asked for.
+    warnings : mapping of str to str
+        Sentences by their codes, the most harmful first.
+    method : str
+        Name of the method, such as "richardson-lucy".
+    steps_done : int
+        Number of steps.
+    stopped_because : str
+        Why the iteration ended.
+    last_change : float
+        Rms of the change in the last step, divided by the rms of the result.
+    flux_in : float
+        Sum of the valid pixels of the image, in its unit.
+    flux_out : float
+        Sum of the same pixels of the result.
+    negative_pixels : int
+        Number of valid pixels below 0 in the image.
+    edges : {"zero", "symmetric", "extended"}
+        Assumption about the scene beyond the field of view.
+    margin_px : int
+        Width of the margin in which the scene was also estimated, px.
+    edge_band_px : int
+        Width of the band along the edges in which the result depends on light from beyond the field, px.
+    noise_amplification : float or None
+        Rms noise of the result divided by that of the image, for uncorrelated noise. None: the method is not linear.
+    chi2_per_pixel : float or None
+        Chi2 of the fit divided by the number of judged pixels. None: the noise is not known.
+    of_box : OfBox or None
+        How a region was deconvolved. None: the whole image was deconvolved.
+    work : Work or BoxWork
+        The computation, from which the measured changes and QUALITY are derived.
     """
 
     psf: Psf
 
     @property
     def mask(self) -> NDArray[np.bool_]:
-        """True for pixels without a measurement: QUALITY 1 or 2 (not finite or masked; saturated), [y, x]."""
+        """Pixels without a measurement, [y, x]: QUALITY 1 or 2 (not finite, masked or saturated)."""
         return np.asarray(self.image.mask != 0)
 
     @property
     def error(self) -> NDArray[np.float64] | None:
-        """Standard deviation of each pixel from noise, and from the PSF if its errors are known; None if not asked for."""
+        """Standard deviation of each pixel, [y, x], in the unit of the image; None: not asked for.
+
+        The noise contributes, and the PSF too if its errors are known.
+        """
         if self.errors is None or self.errors.psf_error is None:
             return None if self.errors is None else self.errors.error
         return np.hypot(self.errors.error, self.errors.psf_error)
 
     @property
     def quality(self) -> NDArray[np.uint8]:
-        """The plane QUALITY of products (docs/products.md): 0 for a good pixel, [y, x]."""
+        """The plane QUALITY of products (docs/products.md), [y, x]; 0: a good pixel."""
         return self.assessed.quality
 
     @property
     def changes(self) -> dict[str, Any]:
-        """What the deconvolution changed: flux, bright and dark structures, signs of artefacts."""
+        """The measured changes: flux, bright and dark structures, and signs of artefacts (JSON)."""
         return self.assessed.changes.as_json()
 
     def lines(self) -> list[str]:
-        """The result in two lines: image, PSF and its doubts; and what changed."""
+        """Describe the result in two lines.
+
+        Returns
+        -------
+        list of str
+            Image, PSF and its doubts; then shape, steps, changes and warnings.
+        """
         ny, nx = self.pixels.shape
         first, *others = summary_lines(self.details())
         warned = f"; warnings: {', '.join(self.warnings)}" if self.warnings else ""
         return [f"Deconvolution of {first}", f"{nx} x {ny} px, {'; '.join(others)}{warned}"]
 
     def plot(self, axes: Axes | None = None) -> Axes:
-        """Draw the deconvolved image. Needs the extra "plot". axes None: new axes."""
+        """Draw the deconvolved image.
+
+        Parameters
+        ----------
+        axes : Axes, optional
+            Where to draw. Default: new axes.
+
+        Returns
+        -------
+        Axes
+            The axes with the image.
+
+        Raises
+        ------
+        MissingExtra
+            The extra "plot" is not installed.
+        """
         drawn: Axes = module_of_extra("heliopsf.plots").draw_image(self, axes)
         return drawn
 
     def plot_change(self, axes: Axes | None = None) -> Axes:
-        """Draw the change in percent of the input. Needs the extra "plot"."""
+        """Draw the change of each pixel in percent of the input.
+
+        Parameters
+        ----------
+        axes : Axes, optional
+            Where to draw. Default: new axes.
+
+        Returns
+        -------
+        Axes
+            The axes with the change.
+
+        Raises
+        ------
+        MissingExtra
+            The extra "plot" is not installed.
+        """
         drawn: Axes = module_of_extra("heliopsf.plots").draw_change(self, axes)
         return drawn
 
     def quicklook(self) -> Figure:
-        """A figure with the image before and after, and the change. Needs the extra "plot"."""
+        """Draw the image before and after, and the change.
+
+        Returns
+        -------
+        Figure
+            Three panels.
+
+        Raises
+        ------
+        MissingExtra
+            The extra "plot" is not installed.
+        """
         figure: Figure = module_of_extra("heliopsf.plots").before_and_after(self)
         return figure
 

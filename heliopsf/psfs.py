@@ -44,11 +44,11 @@ class Shown:
     """A result that shows itself at a prompt and in a notebook: two lines, and its picture."""
 
     def lines(self) -> list[str]:
-        """The result in two lines."""
+        """Describe the result in two lines."""
         raise NotImplementedError
 
     def quicklook(self) -> Figure:
-        """The picture. Needs the extra "plot"."""
+        """Draw the result. Needs the extra "plot"."""
         raise NotImplementedError
 
     def __repr__(self) -> str:
@@ -65,25 +65,95 @@ class Shown:
 
 
 class Psf(Shown, CorePsf):
-    """The weights ``kernel`` [y, x] of a PSF, and how they were obtained.
+    """The weights of a PSF, and how they were obtained.
 
-    A weight is the share of a point source's light that a pixel receives; the centre is [ny // 2, nx // 2]. Further
-    fields: ``components``, ``name``, ``version``, ``instrument``, ``plate_scale_arcsec``, ``wavelength_angstrom``,
-    ``provenance``.
+    A weight is the share of a point source's light that a pixel receives. The weights sum to 1 over 2048 x 2048 px
+    around the centre, and to less on a smaller array.
+
+    Parameters
+    ----------
+    kernel : ndarray of float64, shape (ny, nx)
+        The weights [y, x]. The centre is the pixel [ny // 2, nx // 2].
+    name, version : str
+        Name and version of the PSF.
+    instrument : str or None
+        Name of the instrument, such as "hri_euv". None: unknown.
+    status : str
+        Status of the version, such as "draft", or "user" for weights in memory.
+    plate_scale_arcsec : float, optional
+        Plate scale, arcsec/px.
+    wavelength_angstrom : float, optional
+        Wavelength, angstrom.
+    components : dict of str to ndarray, optional
+        Weights of the components with the same centre, such as "DIFFRACTION" and "SCATTER".
+    provenance : dict, optional
+        How the PSF was made, as texts and numbers for JSON.
+    fitted : FittedShape, optional
+        The fitted formula of "SCATTER", with its covariance.
+    cards : mapping of str to str, optional
+        Texts of the cards TELESCOP, INSTRUME, DETECTOR and FILTER: the images for which the PSF is valid.
+    turn_deg : float, optional
+        Angle from the +x axis of the detector to that of the kernel, degrees.
+
+    Raises
+    ------
+    DataError
+        "psf-not-2d", "psf-too-small", "psf-nonfinite", "psf-negative", "psf-sum", "psf-not-centred" or
+        "psf-off-centre".
     """
 
     def light_beyond(self, radii: ArrayLike | units.Quantity) -> NDArray[Any]:
-        """1 - encircled energy: the light beyond each radius, in percent. radii: px, or quantities in px or angles."""
+        """Measure the light beyond radii: 1 - encircled energy.
+
+        Parameters
+        ----------
+        radii : array_like or Quantity
+            Radii, px. A quantity may be in px or, if the plate scale is known, an angle.
+
+        Returns
+        -------
+        ndarray of float64
+            Light beyond each radius, percent of all light.
+
+        Raises
+        ------
+        DataError
+            "bad-quantity".
+        """
         return cumulative_curve(self.kernel, radii_px(radii, self.plate_scale_arcsec))
 
     def rebinned(self, factor: int) -> Psf:
-        """The PSF for pixels that are means of factor x factor pixels. Raises ``DataError`` "bad-binning"."""
+        """Derive the PSF for binned pixels.
+
+        Parameters
+        ----------
+        factor : int
+            A new pixel is the mean of factor x factor pixels.
+
+        Returns
+        -------
+        Psf
+            The PSF on the new pixels.
+
+        Raises
+        ------
+        DataError
+            "bad-binning".
+        """
         return Psf.of(rebinned(self, whole("factor", factor, "bad-binning")))
 
     def write(self, path: str | Path) -> None:
         """Write the PSF and its components to a FITS file, which every function and command reads.
 
-        A file whose name ends in .gz is written in gzip. Raises ``OSError``, also for a name that ends in .fz.
+        Parameters
+        ----------
+        path : str or path
+            The file. If its name ends in .gz, it is written in gzip.
+
+        Raises
+        ------
+        OSError
+            The file cannot be written, or its name ends in .fz.
         """
         toml = self.provenance.get("instrument_toml")
         check_ending(Path(path))
@@ -91,22 +161,73 @@ class Psf(Shown, CorePsf):
             psfs.write_psf(partial, self, instrument_file=None if toml is None else str(toml).encode())
 
     def plot(self, axes: Axes | None = None, *, size: int = 129) -> Axes:
-        """Draw the central ``size`` px on a logarithmic scale. Needs the extra "plot". axes None: new axes."""
+        """Draw the centre of the PSF on a logarithmic scale.
+
+        Parameters
+        ----------
+        axes : Axes, optional
+            Where to draw. Default: new axes.
+        size : int, optional
+            Width and height of the central part, px.
+
+        Returns
+        -------
+        Axes
+            The axes with the weights.
+
+        Raises
+        ------
+        MissingExtra
+            The extra "plot" is not installed.
+        """
         drawn: Axes = module_of_extra("heliopsf.plots").draw_psf(self, axes, size=size)
         return drawn
 
     def plot_curve(self, axes: Axes | None = None) -> Axes:
-        """Draw 1 - encircled energy by radius, also of the components. Needs the extra "plot"."""
+        """Draw 1 - encircled energy by radius, of the PSF and of its components.
+
+        Parameters
+        ----------
+        axes : Axes, optional
+            Where to draw. Default: new axes.
+
+        Returns
+        -------
+        Axes
+            The axes with the curves.
+
+        Raises
+        ------
+        MissingExtra
+            The extra "plot" is not installed.
+        """
         drawn: Axes = module_of_extra("heliopsf.plots").draw_curves(self, axes)
         return drawn
 
     def quicklook(self) -> Figure:
-        """A figure with the centre, the mean weight by radius and the light beyond a radius. Needs the extra "plot"."""
+        """Draw the centre, the mean weight by radius and the light beyond a radius.
+
+        Returns
+        -------
+        Figure
+            Three panels.
+
+        Raises
+        ------
+        MissingExtra
+            The extra "plot" is not installed.
+        """
         figure: Figure = module_of_extra("psfcore.drawing.plots").psf_figure(self)
         return figure
 
     def lines(self) -> list[str]:
-        """The PSF in two lines: which it is, and where its light is."""
+        """Describe the PSF in two lines.
+
+        Returns
+        -------
+        list of str
+            Which PSF it is; then its shape, where its light is, and its components.
+        """
         origin = [self.instrument or "instrument unknown"]
         origin += [f"{self.wavelength_angstrom:g} angstrom"] if self.wavelength_angstrom else []
         origin += [f"{self.plate_scale_arcsec:.4g} arcsec/px"] if self.plate_scale_arcsec else []
@@ -124,7 +245,18 @@ class Psf(Shown, CorePsf):
 
     @classmethod
     def of(cls, psf: CorePsf) -> Psf:
-        """A PSF of ``psfcore`` with the methods of this class."""
+        """Give a PSF of ``psfcore`` the methods of this class.
+
+        Parameters
+        ----------
+        psf : psfcore.psf.Psf
+            Any PSF.
+
+        Returns
+        -------
+        Psf
+            A PSF with the same fields.
+        """
         return cls(**{field.name: getattr(psf, field.name) for field in fields(CorePsf)})
 
 
@@ -136,23 +268,23 @@ def build_psf(
     threads: int | None = None,
     progress: Progress = None,
 ) -> Psf:
-    """Compute the PSF of an instrument.
+    """Build the PSF of an instrument.
 
     The PSF is kept in the user's cache folder (``heliopsf cache``); the next call reads it there.
 
     Parameters
     ----------
     instrument : str or path
-        The name of a known instrument, such as "hri_euv", or an instrument file (TOML). If the file names a mask image of the
-        mount, that image is read too.
-    size : int
-        An even number from 64 to 4096 (px).
+        The name of a known instrument, such as "hri_euv", or an instrument file (TOML). If the file names a mask
+        image of the mount, that image is read too.
+    size : int, optional
+        Width and height, px: an even number from 64 to 4096.
     component : str, optional
-        Compute only this component, such as "DIFFRACTION".
+        Build only this component, such as "DIFFRACTION".
     threads : int, optional
-        Default: all cores.
+        Number of threads. Default: all cores.
     progress : bool or function, optional
-        True, or a function that is called with (step, steps).
+        True: show a line. A function: it is called with (step, steps).
 
     Returns
     -------
@@ -258,10 +390,26 @@ def built_psf(
 
 
 def read_psf(path: str | Path) -> Psf:
-    """Read a PSF from a FITS file: its ``kernel`` [y, x] and its ``components``, if it has any.
+    """Read a PSF from a FITS file.
 
-    The weights of the kernel sum to 1 over the reach, and to less on a smaller array.
-    Raises ``DataError``, for example "no-such-file" or "not-fits".
+    Parameters
+    ----------
+    path : str or path
+        The file.
+
+    Returns
+    -------
+    Psf
+        With its ``kernel`` [y, x], and its ``components`` if the file has any.
+
+    Raises
+    ------
+    DataError
+        "no-such-file", "not-fits" or another error of the file, and the errors of `Psf`.
+
+    Notes
+    -----
+    The weights sum to 1 over the reach, and to less on a smaller array.
     """
     path = existing_file(path)
     psf = Psf.of(psfs.read_psf(path, LIMITS))
@@ -279,25 +427,33 @@ def interpolate_psf(
     time: datetime | Time | str,
     threads: int | None = None,
 ) -> Psf:
-    """Interpolate between two fitted PSFs in time: the PSF at ``time``, with its errors.
-
-    The coordinates of the fitted shape are interpolated linearly; ``fitted`` of the result holds them with their
-    covariance (``psfcore.scatter.interpolation`` gives the equations). Nothing is extrapolated.
+    """Interpolate between two fitted PSFs in time.
 
     Parameters
     ----------
-    before, after : Psf or path
-        PSFs (``ScatterFit.psf()``) or files, fitted with the same shape and the same diffraction PSF.
-    before_time, after_time, time : datetime, Time or str
-        When the PSFs hold, and the time of the new one, such as "2024-03-01T12:00:00". A time without a zone is UTC.
+    before, after : Psf, str or path
+        PSFs (``ScatterFit.psf()``) or their files, fitted with the same shape and the same diffraction PSF.
+    before_time, after_time : datetime, Time or str
+        When the PSFs hold, such as "2024-03-01T12:00:00". A time without a zone is UTC.
+    time : datetime, Time or str
+        The time of the new PSF, not before ``before_time`` and not after ``after_time``.
     threads : int, optional
-        Default: all cores.
+        Number of threads. Default: all cores.
+
+    Returns
+    -------
+    Psf
+        The PSF at ``time``. Its ``fitted`` has the interpolated coordinates of the shape with their covariance.
 
     Raises
     ------
     DataError
         "bad-time", "psf-not-fitted", "shapes-differ", "psfs-differ", "diffraction-differs", "psf-not-of-its-shape",
         "epochs-not-in-order", "time-outside-epochs", and the errors of ``read_psf``.
+
+    Notes
+    -----
+    The coordinates of the fitted shape are interpolated linearly (equations: ``psfcore.scatter.interpolation``).
     """
     first, second = (
         Epoch(one if isinstance(one, CorePsf) else read_psf(one), utc_time(_moment(at), name))

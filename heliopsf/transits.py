@@ -26,13 +26,52 @@ if TYPE_CHECKING:
 
 
 class ScatterFit(TransitFit):
-    """The fit of a transit: total PSF (``kernel``), ``scatter`` kernel, curves with errors, and limits of the fit."""
+    """The fit of a scatter kernel to a transit.
+
+    Attributes
+    ----------
+    transit : Transit
+        The images, the occulter and the noise figures.
+    solution : Solution
+        The fit with its scenes and optics.
+    overdispersion : float
+        Factor of the variances: chi2 of the disc means per degree of freedom; 1 if chance explains the excess.
+    curve : Curve
+        1 - encircled energy of the total PSF, percent, with standard errors, at radii in px.
+    diffuse_curve : Curve
+        The same for the scatter kernel.
+    kernel : ndarray of float64, shape (2048, 2048)
+        The total PSF [y, x].
+    scatter : ndarray of float64, shape (2048, 2048)
+        The scatter kernel [y, x].
+    first_guess : FirstGuess
+        The light beyond the radius of the occulter's disc, as each image shows it without a fit.
+    free : ShellWeightFits or None
+        The fit of shells without a formula. None: the shape is not isotropic.
+    shapes : tuple of ComparedShape
+        The compared shapes. Empty: the fitted shape is not the softened power law.
+    published : Published or None
+        The fit by the published recipe. None: not asked for.
+    published_alone : dict of str to Published
+        The published recipe with one corrected bias each. Empty: not asked for.
+    limits : tuple of str
+        Sentences on what these data do not determine, and on signs that the fit is unreliable.
+    """
 
     def psf(self, *, name: str | None = None, version: str = "0.1.0") -> Psf:
-        """The fitted PSF, a draft: to plot it, to write it, or to deconvolve images with it.
+        """Make a PSF of the fit, to plot it, to write it, or to deconvolve images with it.
 
-        name: default: the name of the instrument and "-fitted". Its provenance contains the SHA-256 of the files of
-        the transit.
+        Parameters
+        ----------
+        name : str, optional
+            Default: the name of the instrument and "-fitted".
+        version : str, optional
+            Version of the PSF.
+
+        Returns
+        -------
+        Psf
+            A draft. Its ``provenance`` contains the SHA-256 of the files of the transit.
         """
         return Psf.of(
             fitted_psf(
@@ -44,31 +83,140 @@ class ScatterFit(TransitFit):
         )
 
     def plot(self, axes: Axes | None = None) -> Axes:
-        """Draw the light beyond each radius with its error. Needs the extra "plot". axes None: new axes."""
+        """Draw the light beyond each radius with its standard error.
+
+        Parameters
+        ----------
+        axes : Axes, optional
+            Where to draw. Default: new axes.
+
+        Returns
+        -------
+        Axes
+            The axes with the curves.
+
+        Raises
+        ------
+        MissingExtra
+            The extra "plot" is not installed.
+        """
         drawn: Axes = module_of_extra("heliopsf.plots").draw_fit(self, axes)
         return drawn
 
     def quicklook(self) -> Figure:
-        """A figure with curves, residuals and convergence. Needs the extra "plot"."""
+        """Draw curves, residuals and convergence of the fit.
+
+        Returns
+        -------
+        Figure
+            Six panels.
+
+        Raises
+        ------
+        MissingExtra
+            The extra "plot" is not installed.
+        """
         figure: Figure = module_of_extra("psfcore.scatter.plots").fit_figure(self)
         return figure
 
 
 class GapDiagnosis(diagnose.Diagnosis):
-    """The diagnosis of a transit: which effect explains the residuals of the fit."""
+    """The diagnosis of a transit: which effect explains the residuals of the fit.
+
+    Attributes
+    ----------
+    answer : Answer
+        The causes with their alternatives and probabilities, and the verdict.
+    calibration : Calibration
+        The simulated cases from which the probability of a group of alternatives is derived.
+    fits : mapping of str to EffectFit
+        Linear fits of all single effects by name, the most probable first.
+    told : EffectFit or None
+        Linear fit of the told causes together. None: there are none.
+    p_value : float
+        P-value of the gap.
+    limits : Limits
+        Limits of all effects, and the effects that the data cannot tell apart.
+    solution : Solution
+        The fit of the PSF without any cause.
+    model : LinearModel
+        The linear model of residuals and effects.
+    expected : ExpectedGap
+        The residuals that remain if the model is right.
+    noise : MeasuredNoise or None
+        The noise that the images show. None: it could not be measured.
+    where : tuple of Axis
+        How much of the gap varies along each axis, and where it is largest.
+    before_refit : Interval
+        The gap with the PSF that was fitted together with the told causes, but without them: percent of the disc means,
+        with its 90 % interval.
+    rms : Interval
+        The gap with the PSF refitted without any cause, likewise.
+    after : Interval
+        The gap with the told causes in the model, likewise.
+    noise_pct : float
+        Noise of the disc means, rms, percent.
+    shrinking : mapping of str to Shrinking
+        How far each single effect closes the gap, by name.
+    shrinking_of_told : Shrinking or None
+        How far the told causes close the gap together. None: there are none.
+    corrected : Corrected or None
+        The full refit with the told causes. None: the library has no effects to refit, or the refit failed.
+    shapes : mapping of str to FieldShape
+        The shape of each alternative that is another form of its family, by the name of the family.
+    residual : HeldOut or None
+        Residuals of held-out images without the told causes. None: no fold could be fitted.
+    residual_after : HeldOut or None
+        The same with the told causes.
+    cautions : tuple of str
+        Sentences on everything that weakens the result.
+    """
 
     def report(self) -> dict[str, Any]:
-        """The report (JSON): verdict, probabilities, limits, cautions (docs/gap.md)."""
+        """Make the report of the diagnosis.
+
+        Returns
+        -------
+        dict
+            Verdict, probabilities, limits and cautions, as JSON values (docs/gap.md).
+        """
         return gap_report(self)
 
     def plot(self, axes: Axes | None = None) -> Axes:
-        """Draw the probabilities of the effects. Needs the extra "plot". axes None: new axes."""
+        """Draw the probabilities of the effects.
+
+        Parameters
+        ----------
+        axes : Axes, optional
+            Where to draw. Default: new axes.
+
+        Returns
+        -------
+        Axes
+            The axes with the probabilities.
+
+        Raises
+        ------
+        MissingExtra
+            The extra "plot" is not installed.
+        """
         axes = module_of_extra("matplotlib.pyplot").subplots()[1] if axes is None else axes
         module_of_extra("psfcore.gap.report.plot").draw_effects(axes, self.report())
         return axes
 
     def quicklook(self) -> Figure:
-        """A figure with residuals, maps and effects. Needs the extra "plot"."""
+        """Draw residuals, maps and effects.
+
+        Returns
+        -------
+        Figure
+            The panels with their titles.
+
+        Raises
+        ------
+        MissingExtra
+            The extra "plot" is not installed.
+        """
         figure: Figure = module_of_extra("psfcore.gap.report.plot").gap_figure(self, self.report())
         return figure
 
@@ -83,35 +231,35 @@ def fit_scatter(
     threads: int | None = None,
     progress: Stages | bool | None = None,
 ) -> ScatterFit:
-    """Fit the scatter kernel to the stray light that a transit's images show inside the occulter's disc.
+    """Fit a scatter kernel to the stray light inside the occulter's disc of a transit.
 
     Parameters
     ----------
-    transit : path
+    transit : str or path
         A folder with a transit.json.
-    shape : str
-        The formula of the scatter kernel.
+    shape : str, optional
+        The formula of the scatter kernel, such as "stretched" or "two-power-laws".
     noise : (gain, read noise), optional
         DN per photon and DN rms. Default: the values in transit.json.
     saturation_dn : float or Quantity, optional
         Pixels at or above this level (DN) are ignored. Default: the level that the header or the instrument file gives.
-    seed : int
+    seed : int, optional
         Seed of the random numbers.
     threads : int, optional
-        Default: all cores.
+        Number of threads. Default: all cores.
     progress : bool or function, optional
-        True, or a function that is called with (stage, step, steps) after each step.
+        True: show a line. A function: it is called with (stage, step, steps) after each step.
 
     Returns
     -------
     ScatterFit
-        The total PSF (``kernel`` [y, x], 2048 px) and its scatter kernel; the curve of 1 - encircled energy, the parameters with
-        their errors, and the limits of the fit.
+        The total PSF (``kernel`` [y, x], 2048 px) and its scatter kernel; the curve of 1 - encircled energy, the
+        parameters with their errors, and the limits of the fit.
 
     Raises
     ------
     DataError
-        For example "no-manifest" or "too-few-frames".
+        "unknown-shape", "bad-noise", "no-manifest", "too-few-frames" or another error of the transit.
     """
     threads = threads or cores()
     fit = fit_transit(
@@ -138,15 +286,31 @@ def diagnose_gap(
 
     Parameters
     ----------
-    transit, noise, saturation_dn, seed, threads, progress
-        As in ``fit_scatter``, which raises the same errors.
-    coverage : float
-        The probability of the alternatives of each cause together: with a larger one more alternatives are told.
+    transit : str or path
+        A folder with a transit.json.
+    noise : (gain, read noise), optional
+        DN per photon and DN rms. Default: the values in transit.json.
+    saturation_dn : float or Quantity, optional
+        Pixels at or above this level (DN) are ignored. Default: the level that the header or the instrument file gives.
+    coverage : float, optional
+        The probability of the alternatives of each cause together, above 0 and below 1. With a larger one more
+        alternatives are told.
+    seed : int, optional
+        Seed of the random numbers.
+    threads : int, optional
+        Number of threads. Default: all cores.
+    progress : bool or function, optional
+        True: show a line. A function: it is called with (stage, step, steps) after each step.
 
     Returns
     -------
     GapDiagnosis
         Its ``report()`` is the report (JSON).
+
+    Raises
+    ------
+    DataError
+        "bad-coverage", and the errors of ``fit_scatter`` except "unknown-shape".
     """
     threads = threads or cores()
     diagnosis = diagnose.diagnose(

@@ -16,10 +16,16 @@ MOST_TOLD = 20  # if a request has many errors, only the texts of the first ones
 
 
 class DataError(ValueError):
-    """The user's data cannot be used.
+    """Data of the user that cannot be used.
 
-    code: a stable word in kebab-case for programs, such as "all-nan". message: a sentence for people; it says what was
-    expected and what was found. fields: further facts for programs, as JSON values.
+    Parameters
+    ----------
+    code : str
+        A stable word in kebab-case for programs, such as "all-nan".
+    message : str
+        A sentence for people: what was expected, what was found, and what to do next.
+    fields : mapping of str to Any, optional
+        Further facts for programs, as JSON values.
     """
 
     def __init__(self, code: str, message: str, fields: Mapping[str, Any] | None = None) -> None:
@@ -33,7 +39,15 @@ class DataError(ValueError):
 
 
 class DataWarning(UserWarning):
-    """The user's data can be used, but the result may be wrong. code, message: as in `DataError`."""
+    """A warning that data can be used, but that the result may be wrong.
+
+    Parameters
+    ----------
+    code : str
+        A stable word in kebab-case for programs, such as "uncertainty-dropped".
+    message : str
+        A sentence for people.
+    """
 
     def __init__(self, code: str, message: str) -> None:
         super().__init__(message)
@@ -52,7 +66,10 @@ class HeaderError(DataError):
 
 
 class MissingExtra(ImportError):
-    """A function needs packages that an extra of heliopsf installs, and they are not installed."""
+    """Packages that a function needs, which an extra of heliopsf installs, are missing.
+
+    The message names the package and the extra.
+    """
 
 
 def module_of_extra(module: str) -> Any:

@@ -81,12 +81,12 @@ class Psf:
 
     @property
     def total(self) -> float:
-        """Sum of all weights on this array: 1 for the full reach; a larger array may sum to more than 1."""
+        """Sum of all weights: 1 for the full reach; a larger array may sum to more."""
         return float(self.kernel.sum())
 
     @property
     def reach_px(self) -> float:
-        """Distance of the farthest pixel from the centre, in px."""
+        """Distance of the farthest pixel from the centre, px."""
         ny, nx = self.kernel.shape
         return float(np.hypot(ny // 2, nx // 2))
 

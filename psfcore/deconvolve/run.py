@@ -115,15 +115,37 @@ class Product(Deconvolved):
         return f"{seen_by}{f' {date}' if date else ''}"
 
     def title(self, psf: UsedPsf) -> str:
-        """The telescope, the time and the PSF, for the title of a picture."""
+        """Name the telescope, the time and the PSF, for the title of a picture.
+
+        Parameters
+        ----------
+        psf : UsedPsf
+            The PSF as the cards of the result name it.
+
+        Returns
+        -------
+        str
+            One line.
+        """
         return f"{self.name}   PSF {psf.name} {psf.version}"
 
     def details(
         self, used: UsedPsf | None = None, provenance: Mapping[str, Any] | None = None
     ) -> dict[str, Any]:
-        """How the image was deconvolved, the measured changes, and the warnings, as JSON values.
+        """Describe how the image was deconvolved, and what changed.
 
-        used, provenance: of the PSF, if its file does not say them. A bright pixel is at or above the 99th percentile of the input; a dark pixel is at or below the first percentile.
+        Parameters
+        ----------
+        used : UsedPsf, optional
+            The PSF as the cards of the result name it. Default: as its file names it.
+        provenance : mapping of str to Any, optional
+            How the PSF was made. Default: as its file says.
+
+        Returns
+        -------
+        dict
+            The steps, the measured changes and the warnings, as JSON values. A bright pixel is at or above the 99th
+            percentile of the input; a dark pixel is at or below the first percentile.
         """
         image, box, saturation = self.image, self.of_box, self.image.saturation
         before, after = (plane[image.valid].astype(np.float32) for plane in (image.pixels, self.pixels))

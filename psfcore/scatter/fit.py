@@ -137,18 +137,18 @@ class TransitFit:
 
     @property
     def inversion(self) -> Inversion:
-        """The fit of the shape. Its errors do not include overdispersion."""
+        """The fit of the shape; its errors do not include overdispersion."""
         return self.solution.inversion
 
     @property
     def value_sigma(self) -> dict[str, float]:
-        """Standard errors of the parameters, overdispersion included."""
+        """Standard errors of the parameters by name, overdispersion included."""
         factor = math.sqrt(self.overdispersion)
         return {name: factor * sigma for name, sigma in self.inversion.value_sigma.items()}
 
     @property
     def covariance(self) -> NDArray[np.float64]:
-        """Covariance of the shape's coordinates, overdispersion included."""
+        """Covariance matrix of the shape's coordinates, overdispersion included."""
         return self.inversion.covariance * self.overdispersion
 
 

@@ -57,13 +57,7 @@ class Connection:
         transport: httpx.BaseTransport | None = None,
         say: Callable[[str], None] = lambda line: None,
     ) -> None:
-        """server: address of the service; default: HELIOPSF_SERVER. key: access key; default: HELIOPSF_KEY. say: a
-        function that is called with a sentence during a wait, if the job stays in the queue or the service does not
-        answer.
-
-        A service of this machine needs no scheme: ``localhost:8765``. Raises ``ServiceError`` "bad-address", and "bad-key" if
-        the key cannot be sent.
-        """
+        """Prepare the connection. The parameters are those of ``service.client.http.Client``."""
         self.server = service_address(server or os.environ.get("HELIOPSF_SERVER") or DEFAULT_SERVER)
         key = (key or os.environ.get("HELIOPSF_KEY", "")).strip()
         if not (key.isascii() and key.isprintable()) or " " in key:
@@ -94,11 +88,33 @@ class Connection:
         self._http.close()
 
     def health(self) -> dict[str, Any]:
-        """The answer of ``/healthz``."""
+        """Ask whether the service is up.
+
+        Returns
+        -------
+        dict
+            The answer of ``/healthz``: ``status`` and ``version``.
+
+        Raises
+        ------
+        ServiceError
+            "database-away" or "reconciler-stopped", or there was no answer.
+        """
         return self.get("/healthz")
 
     def wait_until_up(self, timeout_s: float = 60.0) -> None:
-        """Wait until the service answers. Raises ``ServiceError`` after ``timeout_s``."""
+        """Wait until the service is up.
+
+        Parameters
+        ----------
+        timeout_s : float, optional
+            Longest wait, s.
+
+        Raises
+        ------
+        ServiceError
+            The error of the last try, after ``timeout_s``.
+        """
         deadline = time.monotonic() + timeout_s
         while True:
             try:
@@ -110,13 +126,43 @@ class Connection:
                 time.sleep(0.1)
 
     def get(self, address: str) -> dict[str, Any]:
-        """The description at an address of the service."""
+        """Get the description at an address of the service.
+
+        Parameters
+        ----------
+        address : str
+            Such as "/v1/products/..." with an id.
+
+        Returns
+        -------
+        dict
+            The description.
+
+        Raises
+        ------
+        ServiceError
+            "no-such-product", "no-such-psf" or another code of the address.
+        """
         return self._json("GET", address)
 
     def download(self, address: str, path: str | Path, *, overwrite: bool = False) -> None:
-        """Download a file of the service. The file appears at ``path`` only when it is complete.
+        """Download a file of the service.
 
-        Raises ``ServiceError`` "download-damaged" if its SHA-256 is not the one that the service recorded.
+        Parameters
+        ----------
+        address : str
+            Address of the file, such as ``file`` of a description.
+        path : str or path
+            Where to write it. The file appears there only when it is complete.
+        overwrite : bool, optional
+            Whether an existing file is replaced.
+
+        Raises
+        ------
+        ServiceError
+            "output-exists"; "download-damaged" if the SHA-256 is not the one that the service recorded.
+        OSError
+            The file cannot be written.
         """
         with (
             written(path, overwrite=overwrite) as partial,
@@ -130,10 +176,27 @@ class Connection:
             _check_digest(response, digest.digest())
 
     def follow(self, address: str) -> Iterator[dict[str, Any]]:
-        """Yield the description of a job or bulk run (address ``/v1/jobs/...``, ``/v1/bulk/...``) now and after each change.
+        """Follow a job or a bulk run until it ends.
 
+        Parameters
+        ----------
+        address : str
+            "/v1/jobs/..." or "/v1/bulk/..." with an id.
+
+        Yields
+        ------
+        dict
+            The description, now and after each change.
+
+        Raises
+        ------
+        ServiceError
+            The service did not answer for 10 minutes, or it refused the request.
+
+        Notes
+        -----
         The iteration ends when the job or bulk run ends or is deleted. If the service does not answer, for example
-        during a restart, the client tries again for up to 10 minutes and then raises ``ServiceError``.
+        during a restart, the client tries again.
         """
         with closing(self._events(f"{address}/events")) as events:
             for event in events:
@@ -146,13 +209,27 @@ class Connection:
     def events(
         self, *, jobs: Sequence[str] = (), bulks: Sequence[str] = ()
     ) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Yield the state of your jobs and bulk runs: ("job", description), ("bulk", description), ("gone", {"kind",
-        "id"}).
+        """Follow all your jobs and bulk runs.
 
-        The iteration first yields the jobs and bulk runs that have not ended or that ended in the last seconds, and
-        those whose ids are in ``jobs`` and ``bulks``. Then the iteration yields each job or bulk run again when its
-        state changes. The iteration does not end by itself. If the service does not answer, the client tries again
-        for up to 10 minutes and then raises ``ServiceError``.
+        Parameters
+        ----------
+        jobs, bulks : sequence of str, optional
+            Ids of jobs and bulk runs whose states are also told if they ended earlier.
+
+        Yields
+        ------
+        tuple of str and dict
+            ("job", description), ("bulk", description) or ("gone", {"kind", "id"}).
+
+        Raises
+        ------
+        ServiceError
+            The service did not answer for 10 minutes, or it refused the request.
+
+        Notes
+        -----
+        The iteration begins with the jobs and bulk runs that have not ended or that ended in the last seconds. Then it
+        tells each one again when its state changes. It does not end by itself.
         """
         with closing(self._events("/v1/events", params={"job": list(jobs), "bulk": list(bulks)})) as events:
             for event in events:

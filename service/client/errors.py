@@ -21,11 +21,20 @@ Answer = TypeVar("Answer")
 
 
 class ServiceError(Exception):
-    """A request was refused, a job failed, or no service answered. The message says why.
+    """A request that was refused, a job that failed, or a service that did not answer.
 
-    status: HTTP status; None if there was no answer. code: the reason as a word, such as "no-such-psf".
-    retry_after_s: time after which the service asks to try again, s. fields: further fields of the problem document, such as
-    ``psfs`` of "no-psf-for-instrument".
+    Parameters
+    ----------
+    message : str
+        A sentence for people: why the request failed.
+    status : int, optional
+        HTTP status of the answer. None: there was no answer, or the client found the error.
+    code : str, optional
+        The reason as a word in kebab-case for programs, such as "no-such-psf". None: heliopsf did not answer.
+    retry_after_s : float, optional
+        Time after which the service asks to try again, s.
+    fields : mapping of str to Any, optional
+        Further fields of the problem document, such as ``psfs`` of "no-psf-for-instrument".
     """
 
     def __init__(

@@ -31,7 +31,23 @@ class Operations(ABC):
 
     @abstractmethod
     def upload_image(self, path: str | Path) -> dict[str, Any]:
-        """Upload a FITS image; returns its description, with its ``id``."""
+        """Upload a FITS image.
+
+        Parameters
+        ----------
+        path : str or path
+            The file.
+
+        Returns
+        -------
+        dict
+            The description of the image, with its ``id``.
+
+        Raises
+        ------
+        ServiceError
+            "empty-upload", "not-fits" or another error of the file.
+        """
 
     @abstractmethod
     def upload_transit(self, path: str | Path) -> dict[str, Any]:
@@ -51,9 +67,29 @@ class Operations(ABC):
         channel: str | None = None,
         kind: str | None = None,
     ) -> dict[str, Any]:
-        """Upload a PSF (FITS); returns its description, with its ``id``.
+        """Upload a PSF.
 
-        instrument, channel, kind: needed if the file does not contain them; a total PSF has ``kind="total"``.
+        Parameters
+        ----------
+        path : str or path
+            The FITS file.
+        name, version : str, optional
+            Name and version of the PSF. Default: those in the file, else the name of the file and a version with its
+            hash.
+        instrument, channel : str, optional
+            Needed if the file does not contain them.
+        kind : str, optional
+            "total": the whole PSF. Default: "uploaded"; such a PSF is used only if a request names it.
+
+        Returns
+        -------
+        dict
+            The description of the PSF, with its ``id``.
+
+        Raises
+        ------
+        ServiceError
+            "psf-not-centred", "psf-sum" or another error of the file.
         """
 
     @abstractmethod
@@ -63,12 +99,47 @@ class Operations(ABC):
 
     @abstractmethod
     def result_id(self, kind: str, **parameters: Any) -> str:
-        """The id that the result of a job with these parameters has or would have. No job is started."""
+        """Get the id that the result of a job has or would have, without starting the job.
+
+        Parameters
+        ----------
+        kind : str
+            Kind of the job, as for ``submit``.
+        **parameters
+            Parameters of the job, as for ``submit``.
+
+        Returns
+        -------
+        str
+            The id. Equal requests have equal ids, except those of the kind "rerun".
+
+        Raises
+        ------
+        ServiceError
+            The errors of ``submit``.
+        """
 
     @abstractmethod
     def image_id(self, path: str | Path, sha256: str) -> str:
-        """The id of an image. If the service does not have the image, the image is uploaded. sha256: hash of the
-        file."""
+        """Get the id of an image; upload the image if the service does not have it.
+
+        Parameters
+        ----------
+        path : str or path
+            The FITS file.
+        sha256 : str
+            SHA-256 of the file, 64 hexadecimal digits.
+
+        Returns
+        -------
+        str
+            The id of the image.
+
+        Raises
+        ------
+        ServiceError
+            The errors of ``upload_image``.
+        """
 
     @abstractmethod
     def release(self, product: dict[str, Any]) -> None:
@@ -97,13 +168,41 @@ class Operations(ABC):
         overwrite: bool = False,
         **parameters: Any,
     ) -> dict[str, Any]:
-        """Upload an image, deconvolve it and download the product to ``output``; returns the description of the product.
+        """Upload an image, deconvolve it and download the product.
 
-        preview, changes: where to write the picture of the image before and after, and the picture of difference, ratio and
-        histograms (PNG). parameters: the fields of ``workers.contract.requests.Deconvolve``, such as ``psf_id``, ``error_draws``
-        or ``region``; ``method="richardson-lucy"`` and the parameters of this method, such as ``steps=20``,
-        ``stop="discrepancy"`` or ``edges="zero"``; ``noise``: photon gain (DN per photon) and read noise (DN rms).
-        ``details["warnings"]`` of the product says what may be wrong with it.
+        Parameters
+        ----------
+        image : str or path
+            The FITS file.
+        output : str or path, optional
+            Where to write the product (FITS). Default: it is not downloaded.
+        preview : str or path, optional
+            Where to write the picture of the image before and after (PNG).
+        changes : str or path, optional
+            Where to write the picture of difference, ratio and histograms (PNG).
+        progress : function, optional
+            It is called with (stage, step, steps).
+        overwrite : bool, optional
+            Whether existing files are replaced.
+        **parameters
+            Values by these names:
+
+            - ``method``: name of the method. Default: "richardson-lucy".
+            - The parameters of the method, such as ``steps=20``, ``stop="discrepancy"`` or ``edges="zero"``.
+            - ``noise``: photon gain (DN per photon) and read noise (DN rms).
+            - The other fields of ``workers.contract.requests.Deconvolve``, such as ``psf_id``, ``error_draws`` or
+              ``region``.
+
+        Returns
+        -------
+        dict
+            The description of the product. ``details["warnings"]`` says what may be wrong with it.
+
+        Raises
+        ------
+        ServiceError
+            "output-exists", "output-is-input", "outputs-equal" or "output-not-writable" before the upload; the errors
+            of ``upload_image`` and ``submit``; and that of the job if it fails.
         """
         check_outputs((output, preview, changes), inputs=(image,), overwrite=overwrite)
         image_id = self.upload_image(image)["id"]
@@ -124,11 +223,36 @@ class Operations(ABC):
         progress: Progress | None = None,
         overwrite: bool = False,
     ) -> dict[str, Any]:
-        """Compute the PSF of an instrument and download it to ``output``; returns its description.
+        """Build the PSF of an instrument and download it.
 
-        instrument: the name of a known instrument, or the path of an instrument file (TOML). size: width and height, px.
-        component: build only this component, such as "diffraction". mask: the mask image (FITS), if the
-        mount in the instrument file names one.
+        Parameters
+        ----------
+        instrument : str or path
+            The name of a known instrument, or the path of an instrument file (TOML).
+        output : str or path, optional
+            Where to write the PSF (FITS). Default: it is not downloaded.
+        size : int, optional
+            Width and height, px: an even number from 64 to 4096.
+        component : str, optional
+            Build only this component, such as "diffraction".
+        mask : str or path, optional
+            The mask image (FITS), if the mount in the instrument file names one.
+        preview : str or path, optional
+            Where to write the picture of the PSF (PNG).
+        progress : function, optional
+            It is called with (stage, step, steps).
+        overwrite : bool, optional
+            Whether existing files are replaced.
+
+        Returns
+        -------
+        dict
+            The description of the PSF.
+
+        Raises
+        ------
+        ServiceError
+            "unknown-instrument" or "bad-instrument-file", and the errors of the files as for ``deconvolve``.
         """
         named = named_instrument(instrument)
         file = instrument if "instrument_file" in named else None
@@ -141,7 +265,23 @@ class Operations(ABC):
         return psf
 
     def psf_of_instrument(self, instrument: str) -> str:
-        """The id of the PSF of an instrument, which is built if it does not exist. instrument: as for ``build_psf``."""
+        """Get the id of the PSF of an instrument, which is built if it does not exist.
+
+        Parameters
+        ----------
+        instrument : str
+            As for ``build_psf``.
+
+        Returns
+        -------
+        str
+            The id of the PSF.
+
+        Raises
+        ------
+        ServiceError
+            The errors of ``build_psf``.
+        """
         return str(self.build_psf(instrument)["id"])
 
     def fit_psf(
@@ -153,10 +293,34 @@ class Operations(ABC):
         preview: str | Path | None = None,
         **options: Any,
     ) -> dict[str, Any]:
-        """Upload a transit (folder or archive), fit its scatter kernel and download the PSF; returns its description.
+        """Upload a transit, fit its scatter kernel and download the PSF.
 
-        report, preview: where to write the report (JSON) and the plot (PNG). options: ``progress``, ``overwrite`` and ``noise`` as for
-        ``deconvolve``, and the fields of ``workers.contract.requests.PsfFit``, such as ``shape="stretched"`` or ``as_published=True``.
+        Parameters
+        ----------
+        transit : str or path
+            A folder or an archive, as for ``upload_transit``.
+        output : str or path, optional
+            Where to write the PSF (FITS). Default: it is not downloaded.
+        report : str or path, optional
+            Where to write the report (JSON).
+        preview : str or path, optional
+            Where to write the plot (PNG).
+        **options
+            Values by these names:
+
+            - ``progress``, ``overwrite``, ``noise``: as for ``deconvolve``.
+            - The fields of ``workers.contract.requests.PsfFit``, such as ``shape="stretched"`` or
+              ``as_published=True``.
+
+        Returns
+        -------
+        dict
+            The description of the PSF.
+
+        Raises
+        ------
+        ServiceError
+            The errors of ``upload_transit`` and ``submit``, of the files as for ``deconvolve``, and of the fit.
         """
         files = {"file": output, "report": report, "preview": preview}
         return self._on_transit("psf-fit", transit, files, **options)
@@ -169,9 +333,31 @@ class Operations(ABC):
         preview: str | Path | None = None,
         **options: Any,
     ) -> dict[str, Any]:
-        """Upload a transit, cross-validate its fit and download the report (JSON); returns its description.
+        """Upload a transit, cross-validate its fit and download the report.
 
-        options: as for ``fit_psf``, and ``scheme="exact"``, ``runs=10``.
+        Parameters
+        ----------
+        transit : str or path
+            A folder or an archive, as for ``upload_transit``.
+        report : str or path, optional
+            Where to write the report (JSON). Default: it is not downloaded.
+        preview : str or path, optional
+            Where to write the plot (PNG).
+        **options
+            Values by these names:
+
+            - ``progress``, ``overwrite``, ``noise``: as for ``deconvolve``.
+            - The fields of ``workers.contract.requests.CrossValidate``, such as ``scheme="exact"`` or ``runs=10``.
+
+        Returns
+        -------
+        dict
+            The description of the report.
+
+        Raises
+        ------
+        ServiceError
+            As for ``fit_psf``.
         """
         return self._on_transit("cross-validate", transit, {"file": report, "preview": preview}, **options)
 
@@ -184,11 +370,35 @@ class Operations(ABC):
         preview: str | Path | None = None,
         **options: Any,
     ) -> dict[str, Any]:
-        """Upload a transit, make a report on its PSF and download the report; returns the description of the report.
+        """Upload a transit, make a report on its PSF and download the report.
 
-        report, page, preview: where to write the report as JSON, as HTML, and its plot (PNG). options: ``progress``,
-        ``overwrite`` and ``noise`` as for ``deconvolve``, ``psf_id`` of a PSF to test (default: fit a PSF), ``seed``,
-        ``dark_offsets``, ``shapes``.
+        Parameters
+        ----------
+        transit : str or path
+            A folder or an archive, as for ``upload_transit``.
+        report : str or path, optional
+            Where to write the report (JSON). Default: it is not downloaded.
+        page : str or path, optional
+            Where to write the report as a page (HTML).
+        preview : str or path, optional
+            Where to write its plot (PNG).
+        **options
+            Values by these names:
+
+            - ``progress``, ``overwrite``, ``noise``: as for ``deconvolve``.
+            - ``psf_id``: a PSF to evaluate. Default: fit a PSF to the transit.
+            - The other fields of ``workers.contract.requests.Report``: ``saturation_dn``, ``seed``, ``dark_offsets``,
+              ``shapes``.
+
+        Returns
+        -------
+        dict
+            The description of the report.
+
+        Raises
+        ------
+        ServiceError
+            As for ``fit_psf``.
         """
         files = {"file": report, "preview": preview, "html": page}
         return self._on_transit("report", transit, files, **options)
@@ -202,11 +412,36 @@ class Operations(ABC):
         preview: str | Path | None = None,
         **options: Any,
     ) -> dict[str, Any]:
-        """Upload a transit, diagnose the gap between it and the fitted model, and download the report; returns its description.
+        """Upload a transit, diagnose the gap between it and the fitted model, download the report.
 
-        report, page, preview: as for ``report``. options: ``progress``, ``overwrite`` and ``noise`` as for ``deconvolve``,
-        ``psf_id`` of a fitted PSF to start from, ``seed``, ``coverage`` of the answer, ``correct`` (whether to make the
-        corrected PSF). If an effect was found, ``details.corrected_psf_id`` is the id of the corrected PSF.
+        Parameters
+        ----------
+        transit : str or path
+            A folder or an archive, as for ``upload_transit``.
+        report : str or path, optional
+            Where to write the report (JSON). Default: it is not downloaded.
+        page : str or path, optional
+            Where to write the report as a page (HTML).
+        preview : str or path, optional
+            Where to write its plot (PNG).
+        **options
+            Values by these names:
+
+            - ``progress``, ``overwrite``, ``noise``: as for ``deconvolve``.
+            - ``psf_id``: a fitted PSF, from which the fit starts.
+            - ``coverage``: the probability of the alternatives of each cause together.
+            - ``correct``: whether a corrected PSF is made, if an effect is found.
+            - ``saturation_dn``, ``seed``: the other fields of ``workers.contract.requests.GapDiagnose``.
+
+        Returns
+        -------
+        dict
+            The description of the report. If there is a corrected PSF, ``details["corrected_psf_id"]`` is its id.
+
+        Raises
+        ------
+        ServiceError
+            As for ``fit_psf``.
         """
         files = {"file": report, "preview": preview, "html": page}
         return self._on_transit("gap-diagnose", transit, files, **options)
@@ -231,7 +466,27 @@ class Operations(ABC):
         return result
 
     def run(self, kind: str, parameters: dict[str, Any], progress: Progress | None) -> dict[str, Any]:
-        """Run a job; returns the description of its result."""
+        """Run a job and wait for its result.
+
+        Parameters
+        ----------
+        kind : str
+            Kind of the job, as for ``submit``.
+        parameters : dict
+            Parameters of the job.
+        progress : function or None
+            It is called with (stage, step, steps).
+
+        Returns
+        -------
+        dict
+            The description of the result.
+
+        Raises
+        ------
+        ServiceError
+            The errors of ``submit`` and ``wait``.
+        """
         job = self.submit(kind, **parameters)
         return self.get(self.wait(job, progress=progress)["result"])
 
