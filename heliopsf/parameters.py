@@ -29,7 +29,9 @@ Stages = Callable[[str, int, int], None]
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Keywords of ``deconvolve`` that all methods have. A number may be a quantity of astropy in a unit that fits.
+    """Keywords of ``deconvolve`` that all methods have.
+
+    A number may be a quantity of astropy in a unit that fits.
 
     Parameters
     ----------
