@@ -27,6 +27,7 @@ from service.http.problems import RESPONSES, Problem, as_problems
 from service.http.quotas import Allowed, check_length
 from service.http.state import Shared, State
 from workers.files.partial_uploads import PartialUpload, PartialUploads
+from workers.intake.uploads import Upload
 
 router = APIRouter(prefix="/v1/uploads", tags=["uploads"], responses=RESPONSES)
 UploadId = Annotated[str, Path(pattern=r"^[0-9a-f]{32}$")]
@@ -235,7 +236,7 @@ def _complete(open_uploads: PartialUploads, upload: PartialUpload, caller: Calle
             )
         kind = KINDS[upload.kind]
         summary = kind.inspect(path, state)
-        row = kind.row(caller.owner, sha256, upload.length, upload.filename, summary)
+        row = kind.row(Upload(caller.owner, sha256, upload.length, upload.filename), summary)
         Allowed(state, caller).keep(path, sha256, row)
     except Problem:
         open_uploads.remove(upload)

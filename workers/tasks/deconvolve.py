@@ -37,6 +37,7 @@ def deconvolve(workspace: Workspace, parameters: Mapping[str, Any]) -> str:
     if not workspace.has(ResultType.PRODUCT, identity):
         file = workspace.image_file(request.image_id)
         workspace.add(make(workspace, request, lambda: load(workspace, request, file)))
+        workspace.report("saving", 1, 1)
     return identity
 
 
