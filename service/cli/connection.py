@@ -16,7 +16,7 @@ from click.shell_completion import CompletionItem
 from psfcore.errors import did_you_mean
 from psfcore.instruments.files import instrument_names
 from psfcore.published_psfs import PUBLISHED, kept_file
-from service.cli.options import options_of, user_errors
+from service.cli.options import options_of
 from service.cli.progress import echo, say
 from service.client.errors import DEFAULT_SERVER, SHOWN_DIGITS
 from service.client.operations import Operations
@@ -50,15 +50,13 @@ class _Id(click.ParamType):
             return text
         if _ID.fullmatch(text.lower()):
             return text.lower()
-        if not self.or_instrument:
-            expected = f"a PSF id ({_DIGITS}) or a file" if self.or_file else f"an id, or its first {_DIGITS}"
-            self.fail(f"expected {expected}; got {value!r}", param, ctx)
-        names = [*instrument_names(), *PUBLISHED]
+        names = [*instrument_names(), *PUBLISHED] if self.or_instrument else []
         if text in names:
             return text
-        meant = did_you_mean(text, names)
-        expected = f"a file, the name of an instrument or of a published PSF, or a PSF id ({_DIGITS})"
-        self.fail(f"expected {expected}; got {value!r}{meant}", param, ctx)
+        expected = f"a PSF id ({_DIGITS}) or a file" if self.or_file else f"an id, or its first {_DIGITS}"
+        if self.or_instrument:
+            expected = f"a file, the name of an instrument or of a published PSF, or a PSF id ({_DIGITS})"
+        self.fail(f"expected {expected}; got {value!r}{did_you_mean(text, names)}", param, ctx)
 
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
@@ -132,7 +130,7 @@ def on_service(command: Command) -> Command:
     @SERVER
     @wraps(command)
     def connected(server: str | None, **given: Any) -> Any:
-        with user_errors(), remote(server) as service:
+        with remote(server) as service:
             return command(service=service, **given)
 
     return connected  # type: ignore[return-value]

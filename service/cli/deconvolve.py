@@ -28,7 +28,6 @@ from service.cli.options import (
     options_of,
     progress_bar,
     say_warnings,
-    user_errors,
     write_json,
 )
 from service.cli.progress import Report, echo
@@ -101,14 +100,12 @@ def deconvolve(
         raise click.UsageError(
             "--plot and --changes: expected one image and an output file; for several images use `heliopsf changes`"
         )
-    with user_errors():
-        psf_files = [Path(psf)] if psf and Path(psf).is_file() else []
-        if into_folder:
-            check_output_folder(output.path)
-        else:
-            check_outputs((output.path, plot, changes), inputs=[*files, *psf_files], overwrite=overwrite)
+    psf_files = [Path(psf)] if psf and Path(psf).is_file() else []
+    if into_folder:
+        check_output_folder(output.path)
+    else:
+        check_outputs((output.path, plot, changes), inputs=[*files, *psf_files], overwrite=overwrite)
     with (
-        user_errors(),
         connection(server, local) as service,
         progress_bar() as report,
     ):
@@ -218,12 +215,11 @@ def changes(
     if not files:
         raise click.UsageError("expected FITS files; the folders that you named contain none")
     table_file, sheet_file = output / TABLE, output / SHEET
-    with user_errors():
-        check_output_folder(output)
-        if output.is_dir():
-            psf_file = psf if psf and Path(psf).is_file() else None
-            check_outputs((table_file, sheet_file), inputs=(*files, psf_file), overwrite=overwrite)
-    with user_errors(), connection(server, local) as service, progress_bar() as report:
+    check_output_folder(output)
+    if output.is_dir():
+        psf_file = psf if psf and Path(psf).is_file() else None
+        check_outputs((table_file, sheet_file), inputs=(*files, psf_file), overwrite=overwrite)
+    with connection(server, local) as service, progress_bar() as report:
         parameters["psf_id"] = named_psf(service, psf)
         products: dict[str, dict[str, Any]] = {}
         treated, failures = treat_many(

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -61,9 +61,6 @@ from workers.settings import Settings
 from workers.stage_timer import StageTimer
 from workers.versions import name_of_upload
 
-if TYPE_CHECKING:
-    pass
-
 COMPILING = "compiling kernels (only once)"
 _NOW = "now"  # the context that a service without contexts has too
 
@@ -91,8 +88,7 @@ class Local(Operations):
 
     def image_id(self, path: str | Path, sha256: str) -> str:
         """Add an image; returns its id."""
-        identity: str = self.upload_image(path)["id"]
-        return identity
+        return str(self.upload_image(path)["id"])
 
     def upload_transit(self, path: str | Path) -> dict[str, Any]:
         """Add a transit, after the same check of its table of contents as in a service."""

@@ -101,29 +101,24 @@ class _Teller:
                 filled = round(20 * step / max(steps, 1))
                 drawn = "#" * filled + "-" * (20 - filled)
                 elapsed_s = now_s - self.started_s
-                sys.stderr.write(
-                    f"\r{printable(stage):<32.32} [{drawn}] {step}/{steps}  {elapsed_s:5.1f} s{left:<14}"
-                )
-                sys.stderr.flush()
+                bar = f"\r{printable(stage):<32.32} [{drawn}] {step}/{steps}  {elapsed_s:5.1f} s{left:<14}"
+                click.echo(bar, err=True, nl=False)
                 self.open_line = True
             elif now_s - self.told_s >= LINE_EVERY_S:
                 self.told_s = now_s
                 elapsed = duration(now_s - self.started_s)
-                told = printable(step_text(stage, step, steps))
-                sys.stderr.write(f"{told} after {elapsed}{left}\n")
-                sys.stderr.flush()
+                echo(f"{step_text(stage, step, steps)} after {elapsed}{left}", err=True)
 
     def line(self, text: str) -> None:
         """Write a text on a separate line."""
         with self.lock:
             self.end()
-            sys.stderr.write(f"{printable(text)}\n")
-            sys.stderr.flush()
+            echo(text, err=True)
 
     def end(self) -> None:
         """End the line of the bar."""
         if self.open_line:
-            sys.stderr.write("\n")
+            echo("", err=True)
             self.open_line = False
 
 

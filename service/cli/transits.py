@@ -29,7 +29,6 @@ from service.cli.options import (
     limits,
     options_of,
     progress_bar,
-    user_errors,
     write_file,
     write_json,
     writes_files,
@@ -61,7 +60,6 @@ def _reporting(
     json_file: None: the file is temporary. gap_effects: as in `connection`.
     """
     with (
-        user_errors(),
         TemporaryDirectory(prefix="heliopsf-") as folder,
         connection(server, local, gap_effects=gap_effects) as service,
         progress_bar() as say,
@@ -305,7 +303,7 @@ def blind(
 
     if clean_only and only:
         raise click.UsageError("expected one of --clean-only and --only; got both")
-    with user_errors(), alone_in(output):
+    with alone_in(output):
         plan = SetPlan(cases, seed, size, images, only, clean_only, not synthetic, left_pct)
         planes = [image_rate(file, limits()) for file in scenes]
         blind_set, not_made = make_set(output, plan, scenes=planes, processes=processes, progress=say)
@@ -354,17 +352,16 @@ def plan(
     from psfcore.gap.planning import limits_of_file
     from psfcore.gap.report.limits import lines, plan_page
 
-    with user_errors():
-        with progress_bar() as say:
-            found = limits_of_file(
-                plan_file,
-                limits(),
-                instrument=instrument,
-                diffraction=diffraction,
-                seed=seed,
-                threads=THREADS,
-                progress=say,
-            )
-        write_json(json_file, found.as_json(), overwrite=overwrite)
-        write_file(output, lambda file: file.write_text(plan_page(found), "utf-8"), overwrite=overwrite)
+    with progress_bar() as say:
+        found = limits_of_file(
+            plan_file,
+            limits(),
+            instrument=instrument,
+            diffraction=diffraction,
+            seed=seed,
+            threads=THREADS,
+            progress=say,
+        )
+    write_json(json_file, found.as_json(), overwrite=overwrite)
+    write_file(output, lambda file: file.write_text(plan_page(found), "utf-8"), overwrite=overwrite)
     echo("\n".join(lines(found)))

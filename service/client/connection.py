@@ -16,6 +16,7 @@ from typing import Any, Self
 
 import httpx
 
+from psfcore.files import sha256_of
 from service.client.errors import (
     DEFAULT_SERVER,
     FIRST_WAIT_S,
@@ -272,10 +273,8 @@ def upload_in_parts(ask: Ask, path: Path, kind: str, filename: str, say: Callabl
     ask(method, address, ...): sends a request. Raises ``ServiceError`` if the service refuses the file, or if it does not
     answer for 10 minutes.
     """
-    with path.open("rb") as file:
-        sha256 = hashlib.file_digest(file, "sha256").hexdigest()
     length = path.stat().st_size
-    metadata = {"kind": kind, "filename": filename, "sha256": sha256}
+    metadata = {"kind": kind, "filename": filename, "sha256": sha256_of(path)}
     text = ",".join(f"{key} {base64.b64encode(value.encode()).decode()}" for key, value in metadata.items())
     headers = TUS | {"Upload-Length": str(length), "Upload-Metadata": text}
     patience = Patience(say, "Trying to continue the upload")

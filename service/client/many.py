@@ -11,7 +11,6 @@ recognised by their cards INPSHA and PRODID, whatever their names.
 
 from __future__ import annotations
 
-import hashlib
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from psfcore.errors import DataError, HeaderError
-from psfcore.files import fits_in
+from psfcore.files import fits_in, sha256_of
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.cards import optional_text
 from psfcore.fits.header import all_hdus, first_image_header
@@ -149,8 +148,7 @@ class _Run:
         No job is submitted if the folder already contains the product, or if the job of an earlier image makes the
         same product.
         """
-        with image.open("rb") as file:
-            sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+        sha256 = sha256_of(image)
         image_id = _patiently(lambda: self.service.image_id(image, sha256))
         request = deconvolution(image_id, **self.parameters)
         product_id = _patiently(lambda: self.service.result_id("deconvolve", **request))

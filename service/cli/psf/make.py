@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -19,11 +20,10 @@ from service.cli.options import (
     options_of,
     progress_bar,
     psf_limits,
-    user_errors,
+    write_file,
     writes_files,
 )
 from service.cli.progress import echo
-from service.client.outputs import written
 from workers.contract.requests import CrossValidate, PsfBuild, PsfFit
 
 SHOWN_RADII_PX = (0.5, 1, 2, 5, 10, 11.5, 20, 50, 100, 200, 500, 1000)
@@ -53,7 +53,6 @@ def build(
 ) -> None:
     """Compute the PSF of an instrument."""
     with (
-        user_errors(),
         _mask_of(instrument) as mask,
         connection(server, local) as service,
         progress_bar() as report,
@@ -94,7 +93,7 @@ def fit(
     **parameters: Any,
 ) -> None:
     """Fit the scattered light in TRANSIT: a folder with a transit.json, or a .zip or .tar file of such a folder."""
-    with user_errors(), connection(server, local) as service, progress_bar() as say:
+    with connection(server, local) as service, progress_bar() as say:
         fitted = service.fit_psf(
             transit,
             output,
@@ -142,7 +141,7 @@ def crossval(
     **parameters: Any,
 ) -> None:
     """Estimate the uncertainty of the fit to TRANSIT: hold out blocks of images and bootstrap the other images, in many runs."""
-    with user_errors(), connection(server, local) as service, progress_bar() as report:
+    with connection(server, local) as service, progress_bar() as report:
         found = service.cross_validate(
             transit,
             json_file,
@@ -165,13 +164,11 @@ def show(file: Path, plot: Path | None, overwrite: bool) -> None:
     from psfcore.fits.psfs import read_psf
     from psfcore.psf import cumulative_curve
 
-    with user_errors():
-        psf = read_psf(file, psf_limits())
-        if plot is not None:
-            from psfcore.drawing.plots import psf_png
+    psf = read_psf(file, psf_limits())
+    if plot is not None:
+        from psfcore.drawing.plots import psf_png
 
-            with written(plot, overwrite=overwrite) as picture:
-                psf_png(psf, picture)
+        write_file(plot, partial(psf_png, psf), overwrite=overwrite)
     radii = np.array([r for r in SHOWN_RADII_PX if r < psf.reach_px])
     kernels = {"TOTAL": psf.kernel, **psf.components}
     curves = {name: cumulative_curve(kernel, radii) for name, kernel in kernels.items()}

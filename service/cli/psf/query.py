@@ -10,6 +10,7 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +26,6 @@ from service.cli.options import (
     OUTPUT,
     progress_bar,
     psf_limits,
-    user_errors,
     write_json,
     writes_files,
 )
@@ -82,7 +82,7 @@ def get_psfs(names: tuple[str, ...], source: Path | None) -> None:
 
 def brought(name: str, source: Path | None) -> Path:
     """The file of a published PSF, which is brought first if it is not there; says where it is and how to cite it."""
-    with user_errors(), progress_bar() as report:
+    with progress_bar() as report:
         file = get(published_folder(), name, source=source, progress=report)
     one = published(name)
     echo(f"{file}: PSF {one.name}, {one.telescope} {one.channel}")
@@ -119,17 +119,17 @@ def query(
 ) -> None:
     """Show the light of a PSF beyond radii or in an annulus, and the difference from another PSF."""
     answers: dict[str, Any] = {}
-    with user_errors(), _asking(server, psf, compare) as ask:
+    with _asking(server, psf, compare) as ask:
         if radii or not (annulus or profile or compare):
-            reach_px = ask("encircled", radius=0.0)["reach_px"]
+            reach_px = ask["encircled"](radius=0.0)["reach_px"]
             shown = list(radii) or [r for r in SHOWN_RADII_PX if r <= reach_px]
-            answers["curve"] = ask("curve", radii=shown)
+            answers["curve"] = ask["curve"](radii=shown)
         if annulus is not None:
-            answers["annulus"] = ask("annulus", inner=annulus[0], outer=annulus[1])
+            answers["annulus"] = ask["annulus"](inner=annulus[0], outer=annulus[1])
         if profile:
-            answers["profile"] = ask("profile")
+            answers["profile"] = ask["profile"]()
         if compare is not None:
-            answers["compare"] = ask("compare")
+            answers["compare"] = ask["compare"]()
     for name, answer in answers.items():
         echo("\n".join(_LINES[name](answer)))
     write_json(json_file, answers, overwrite=overwrite)
@@ -147,12 +147,11 @@ def cutout(psf: str, size: int, output: Path, server: str | None, overwrite: boo
     """Write the central part of a PSF, not renormalised. If the PSF is a file, the components are written too."""
     from psfcore.psf import central_part
 
-    with user_errors():
-        if is_psf_id(psf):
-            with remote(server) as service:
-                service.psf_cutout(psf, size, output, overwrite=overwrite)
-        else:
-            _write(output, central_part(_read(psf), size), overwrite)
+    if is_psf_id(psf):
+        with remote(server) as service:
+            service.psf_cutout(psf, size, output, overwrite=overwrite)
+    else:
+        _write(output, central_part(_read(psf), size), overwrite)
     echo(f"{output}: central {size} x {size} px")
 
 
@@ -166,7 +165,7 @@ def rebin(psf: str, factor: int, output: Path, server: str | None, overwrite: bo
     """Write the PSF for images that are binned by FACTOR x FACTOR pixels."""
     from psfcore.psf_sampling import rebinned
 
-    with user_errors(), psf_file(server, psf) as file:
+    with psf_file(server, psf) as file:
         binned = rebinned(_read(str(file)), factor)
         _write(output, binned, overwrite)
     ny, nx = binned.kernel.shape
@@ -185,12 +184,11 @@ def cache() -> None:
 @cache.command("list", short_help="List the PSFs that are kept.")
 def list_cached() -> None:
     """List the PSFs that are kept, the last used first: id, size, last use, instrument."""
-    with user_errors():
-        folder = psf_cache()
-        psfs = folder.psfs()
-        for psf in psfs:
-            used = datetime.fromtimestamp(psf.used_at, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
-            echo(f"{short(psf.identity)}  {psf.bytes / _MIB:8.1f} MiB  {used}  {_named(folder, psf)}")
+    folder = psf_cache()
+    psfs = folder.psfs()
+    for psf in psfs:
+        used = datetime.fromtimestamp(psf.used_at, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+        echo(f"{short(psf.identity)}  {psf.bytes / _MIB:8.1f} MiB  {used}  {_named(folder, psf)}")
     total = sum(psf.bytes for psf in psfs) / _MIB
     echo(f"{len(psfs)} PSFs, {total:.1f} of {folder.max_bytes // _MIB} MiB, in {folder.folder}")
 
@@ -198,9 +196,8 @@ def list_cached() -> None:
 @cache.command("clear", short_help="Remove all PSFs that are kept.")
 def clear() -> None:
     """Remove all PSFs that are kept. A PSF is built again when it is needed."""
-    with user_errors():
-        folder = psf_cache()
-        count, removed = len(folder.psfs()), folder.clear()
+    folder = psf_cache()
+    count, removed = len(folder.psfs()), folder.clear()
     echo(f"removed {count} PSFs, {removed / _MIB:.1f} MiB, from {folder.folder}")
 
 
@@ -215,8 +212,10 @@ def _named(folder: PsfCache, psf: CachedPsf) -> str:
 
 
 @contextmanager
-def _asking(server: str | None, psf: str, other: str | None) -> Iterator[Callable[..., dict[str, Any]]]:
-    """A function that answers questions about a PSF, and compares it with another one: the service answers for ids; for
+def _asking(
+    server: str | None, psf: str, other: str | None
+) -> Iterator[dict[str, Callable[..., dict[str, Any]]]]:
+    """The functions that answer questions about a PSF, and compare it with another one: the service answers for ids; for
     files the tables are computed here."""
     psfs = [psf] if other is None else [psf, other]
     if len({is_psf_id(one) for one in psfs}) > 1:
@@ -227,23 +226,18 @@ def _asking(server: str | None, psf: str, other: str | None) -> Iterator[Callabl
         from psfcore.tables.make import tables_of
 
         tables = [tables_of(_read(file)) for file in psfs]
-
-        def ask_files(question: str, **query: Any) -> dict[str, Any]:
-            if question == "compare":
-                return lookup.compare(*tables)
-            return lookup.QUESTIONS[question](tables[0], **query)
-
-        yield ask_files
+        of_first = {name: partial(question, tables[0]) for name, question in lookup.QUESTIONS.items()}
+        yield of_first | {"compare": partial(lookup.compare, *tables)}
         return
     with remote(server) as service:
         ids = [whole_id(service, "psfs", one) for one in psfs]
-
-        def ask_service(question: str, **query: Any) -> dict[str, Any]:
-            if question == "compare":
-                return service.compare_psfs(*ids)
-            return service.answer(ids[:1], question, query)
-
-        yield ask_service
+        yield {
+            "curve": partial(service.psf_curve, ids[0]),
+            "profile": partial(service.psf_profile, ids[0]),
+            "encircled": partial(service.psf_encircled, ids[0]),
+            "annulus": partial(service.psf_annulus, ids[0]),
+            "compare": partial(service.compare_psfs, *ids),
+        }
 
 
 def _read(file: str) -> Psf:
