@@ -25,9 +25,9 @@ from service.cli.connection import (
     short,
     whole_id,
 )
-from service.cli.jobs import MOST, moment
+from service.cli.jobs import MOST
 from service.cli.options import OUTPUT, Text, fits_files, options_of, progress_bar, write_file, writes_files
-from service.cli.progress import duration, echo
+from service.cli.progress import duration, echo, moment
 from service.client.errors import ServiceError
 from service.client.operations import treatment
 from workers.contract.requests import Treatment

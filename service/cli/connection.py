@@ -31,6 +31,7 @@ DIGITS = 64  # number of digits of a whole id, except ids of jobs and bulk runs
 _ID = re.compile(rf"[0-9a-f]{{{FEWEST_DIGITS},{DIGITS}}}")
 _DIGITS = f"{FEWEST_DIGITS} or more hexadecimal digits"
 Command = TypeVar("Command", bound=Callable[..., Any])
+Thing = TypeVar("Thing")
 Row = dict[str, Any]
 
 
@@ -136,7 +137,7 @@ def on_service(command: Command) -> Command:
     return connected  # type: ignore[return-value]
 
 
-def print_rows(rows: Iterable[Row], line: Callable[[Row], str], *, if_none: str) -> None:
+def print_rows(rows: Iterable[Thing], line: Callable[[Thing], str], *, if_none: str) -> None:
     """Print a line for each row of a list. if_none: what to print if there are no rows."""
     lines = [line(row).rstrip() for row in rows]
     echo("\n".join(lines or [if_none]))

@@ -32,7 +32,7 @@ from service.cli.options import (
 )
 from service.cli.progress import Report, echo
 from service.client.errors import ServiceError
-from service.client.many import Outcome, deconvolve_many
+from service.client.many import FOR_ALL, Outcome, deconvolve_many
 from service.client.operations import Operations
 from service.client.outputs import check_output_folder, check_outputs, written
 from service.start import STARTED
@@ -51,8 +51,6 @@ OPTIONS = (
 
 TABLE, SHEET = "changes.json", "contact-sheet.png"
 SHOWN = 20
-# These errors concern every image, so the command stops.
-FOR_ALL = (401, 403)
 
 
 @click.command(epilog=methods_help())
@@ -88,9 +86,7 @@ def deconvolve(
 
     The output is a folder for several images, or if its name ends in /. Images whose product is in the folder are skipped.
     """
-    files = fits_files(images)
-    if not files:
-        raise click.UsageError("expected FITS files; the folders that you named contain none")
+    files = _fits_files(images)
     if timings and not local:
         raise click.UsageError(
             "--timings: expected --local, because a service measures the stages of all jobs together; see its /metrics"
@@ -122,6 +118,13 @@ def deconvolve(
         raise click.ClickException(
             f"{len(failures)} of {counted(len(files), 'image')} failed; see the list above"
         )
+
+
+def _fits_files(images: tuple[Path, ...]) -> list[Path]:
+    files = fits_files(images)
+    if not files:
+        raise click.UsageError("expected FITS files; the folders that you named contain none")
+    return files
 
 
 def _timings(service: Operations) -> list[str]:
@@ -211,9 +214,7 @@ def changes(
     """
     from psfcore.deconvolve.assess.pictures import contact_sheet_png, table, treat_many
 
-    files = [str(path) for path in fits_files(images)]
-    if not files:
-        raise click.UsageError("expected FITS files; the folders that you named contain none")
+    files = [str(path) for path in _fits_files(images)]
     table_file, sheet_file = output / TABLE, output / SHEET
     check_output_folder(output)
     if output.is_dir():

@@ -6,7 +6,6 @@ import json
 import re
 import shutil
 import time
-from datetime import UTC, datetime
 from functools import wraps
 from pathlib import Path
 from typing import Any
@@ -17,8 +16,9 @@ from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
 from psfcore.files import sha256_of
 from psfcore.fits.header import read_summary
+from service.cli.connection import print_rows
 from service.cli.options import DATA, Command, Text, read_settings
-from service.cli.progress import echo
+from service.cli.progress import echo, moment
 from service.cli.psf.query import NAMES, SOURCE, brought
 from workers import checks
 from workers.catalogue.access import MEANINGS, OWNER, OWNER_RULE, Scope
@@ -35,6 +35,7 @@ from workers.settings import Settings
 from workers.texts import check_line
 from workers.versions import TOTAL
 
+TO_MINUTES = "%Y-%m-%d %H:%MZ"
 DAY_S = 86_400
 UNITS_S = {"h": 3600, "d": DAY_S, "w": 7 * DAY_S}
 DEFAULT_SCOPES = (Scope.READ, Scope.SUBMIT)
@@ -311,7 +312,7 @@ def create(
     url = make_url(settings.catalogue_url).render_as_string(hide_password=True)
     catalogue.upgrade()
     echo(catalogue.keys.make(owner, allowed, label=label, expires_at=expires_at))
-    ends = "until it is revoked" if expires_at is None else f"until {_day(expires_at)}"
+    ends = "until it is revoked" if expires_at is None else f"until {moment(expires_at, TO_MINUTES)}"
     echo(
         f"for {owner}: {', '.join(sorted(allowed))}; {ends}. The key cannot be shown again. Clients read it from "
         f"HELIOPSF_KEY. Servers that use the database {url} accept it.",
@@ -330,14 +331,8 @@ def list_keys(_settings: Settings, catalogue: Catalogue, as_json: bool) -> None:
     rows = catalogue.keys.all()
     if as_json:
         echo(json.dumps([_described(row) for row in rows], indent=1))
-    elif not rows:
-        echo("no key yet; `heliopsf key create --owner NAME` makes a key")
-    for row in () if as_json else rows:
-        used = "never used" if row.last_used_at is None else f"used {_day(row.last_used_at)}"
-        echo(
-            f"{row.id}  {row.owner:<16}  {_state(row):<8}  {','.join(row.scopes):<24}  "
-            f"made {_day(row.created_at)}, {used}  {row.label}".rstrip()
-        )
+    else:
+        print_rows(rows, _key_line, if_none="no key yet; `heliopsf key create --owner NAME` makes a key")
 
 
 @key.command("revoke", short_help="Revoke a key.")
@@ -358,11 +353,15 @@ def _state(row: KeyRow) -> str:
     return "expired" if row.expires_at is not None and row.expires_at <= time.time() else "good"
 
 
+def _key_line(row: KeyRow) -> str:
+    used = "never used" if row.last_used_at is None else f"used {moment(row.last_used_at, TO_MINUTES)}"
+    return (
+        f"{row.id}  {row.owner:<16}  {_state(row):<8}  {','.join(row.scopes):<24}  "
+        f"made {moment(row.created_at, TO_MINUTES)}, {used}  {row.label}"
+    )
+
+
 def _described(row: KeyRow) -> dict[str, object]:
     """A key as JSON, without its hash."""
     shown = ("id", "owner", "scopes", "label", "created_at", "expires_at", "revoked_at", "last_used_at")
     return {name: getattr(row, name) for name in shown} | {"state": _state(row)}
-
-
-def _day(seconds: float) -> str:
-    return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%MZ")

@@ -13,6 +13,7 @@ import unicodedata
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import UTC, datetime
 
 import click
 
@@ -65,6 +66,11 @@ def duration(seconds: float) -> str:
         if seconds >= 2 * length_s:
             return f"{seconds / length_s:.0f} {unit}"
     return f"{seconds:.0f} s"
+
+
+def moment(seconds: float, form: str = "%Y-%m-%d %H:%M:%SZ") -> str:
+    """A time as text, in UTC."""
+    return datetime.fromtimestamp(seconds, UTC).strftime(form)
 
 
 def step_text(stage: str, step: int, steps: int) -> str:

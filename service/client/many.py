@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -74,7 +74,7 @@ def deconvolve_many(
     """
     check_output_folder(folder)
     Path(folder).mkdir(parents=True, exist_ok=True)
-    run = _Run(service, images, Path(folder), overwrite, parameters)
+    run = _Run(service, images, Path(folder), overwrite, parameters, _products_in(Path(folder)))
     progress(0, len(images))
     for number, outcome in enumerate(run.outcomes(), 1):
         yield outcome
@@ -104,10 +104,8 @@ class _Run:
     folder: Path
     overwrite: bool
     parameters: dict[str, Any]
-
-    def __post_init__(self) -> None:
-        self._products = _products_in(self.folder)
-        self._pending: deque[_Pending | Outcome] = deque()
+    _products: _Products
+    _pending: deque[_Pending | Outcome] = field(default_factory=deque)
 
     def outcomes(self) -> Iterator[Outcome]:
         """The outcome for each image. Raises the same errors as ``deconvolve_many``."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,7 +28,7 @@ from service.cli.options import (
     write_json,
     writes_files,
 )
-from service.cli.progress import echo
+from service.cli.progress import echo, moment
 from service.client.outputs import written
 from workers.machine import psf_cache, published_folder
 
@@ -187,7 +186,7 @@ def list_cached() -> None:
     folder = psf_cache()
     psfs = folder.psfs()
     for psf in psfs:
-        used = datetime.fromtimestamp(psf.used_at, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+        used = moment(psf.used_at, "%Y-%m-%dT%H:%M:%SZ")
         echo(f"{short(psf.identity)}  {psf.bytes / _MIB:8.1f} MiB  {used}  {_named(folder, psf)}")
     total = sum(psf.bytes for psf in psfs) / _MIB
     echo(f"{len(psfs)} PSFs, {total:.1f} of {folder.max_bytes // _MIB} MiB, in {folder.folder}")

@@ -161,7 +161,7 @@ def test_nothing_is_sent_or_kept_twice(
     with local() as here:
         parameters["psf_id"] = here.upload_psf(tmp_path / "psf.fits")["id"]
         list(deconvolve_many(here, images[:1], tmp_path / "other", **parameters))
-        assert not here._writers, "products stay in the folder only"
+        assert not here.inputs.results, "products stay in the folder only"
 
 
 def test_an_error_that_concerns_every_image_ends_the_run(tmp_path: Path, images: list[Path]) -> None:
