@@ -34,7 +34,7 @@ from service.cli.options import (
     writes_files,
 )
 from service.cli.progress import Report as Progress
-from service.cli.progress import echo
+from service.cli.progress import echo, say
 from service.client.operations import Operations
 from workers.contract.requests import GapDiagnose, Report
 
@@ -62,9 +62,9 @@ def _reporting(
     with (
         TemporaryDirectory(prefix="heliopsf-") as folder,
         connection(server, local, gap_effects=gap_effects) as service,
-        progress_bar() as say,
+        progress_bar() as show,
     ):
-        yield service, json_file or Path(folder) / "report.json", say
+        yield service, json_file or Path(folder) / "report.json", show
 
 
 @click.command()
@@ -100,13 +100,13 @@ def report(
         raise click.UsageError(
             "--shapes fits every shape to TRANSIT, so it cannot be used with --psf: remove one of the two"
         )
-    with _reporting(server, local, json_file) as (service, numbers, say):
+    with _reporting(server, local, json_file) as (service, numbers, show):
         found = service.report(
             transit,
             numbers,
             page=output,
             preview=plot,
-            progress=say,
+            progress=show,
             psf_id=named_psf(service, psf),
             overwrite=overwrite,
             **parameters,
@@ -188,13 +188,13 @@ def diagnose(
         raise click.UsageError(
             "--effects: expected --local with it; a service tests the effects in HELIOPSF_GAP_EFFECTS"
         )
-    with _reporting(server, local, json_file, gap_effects=effects or "") as (service, numbers, say):
+    with _reporting(server, local, json_file, gap_effects=effects or "") as (service, numbers, show):
         found = service.diagnose_gap(
             transit,
             numbers,
             page=output,
             preview=plot,
-            progress=say,
+            progress=show,
             psf_id=named_psf(service, psf),
             # A service always makes the corrected PSF and keeps it, so that later requests find it.
             correct=corrected_file is not None or not local,
@@ -298,9 +298,6 @@ def blind(
     from psfcore.blind.score import write_score
     from psfcore.simulate.inputs import image_rate
 
-    def say(line: str) -> None:
-        echo(line, err=True)
-
     if clean_only and only:
         raise click.UsageError("expected one of --clean-only and --only; got both")
     with alone_in(output):
@@ -352,7 +349,7 @@ def plan(
     from psfcore.gap.planning import limits_of_file
     from psfcore.gap.report.limits import lines, plan_page
 
-    with progress_bar() as say:
+    with progress_bar() as show:
         found = limits_of_file(
             plan_file,
             limits(),
@@ -360,7 +357,7 @@ def plan(
             diffraction=diffraction,
             seed=seed,
             threads=THREADS,
-            progress=say,
+            progress=show,
         )
     write_json(json_file, found.as_json(), overwrite=overwrite)
     write_file(output, lambda file: file.write_text(plan_page(found), "utf-8"), overwrite=overwrite)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -53,14 +51,14 @@ def build(
 ) -> None:
     """Compute the PSF of an instrument."""
     with (
-        _mask_of(instrument) as mask,
+        TemporaryDirectory(prefix="heliopsf-") as folder,
         connection(server, local) as service,
         progress_bar() as report,
     ):
         built = service.build_psf(
             instrument,
             output,
-            mask=mask,
+            mask=_mask_of(instrument, folder),
             preview=plot,
             progress=report,
             overwrite=overwrite,
@@ -183,12 +181,10 @@ def show(file: Path, plot: Path | None, overwrite: bool) -> None:
         echo(f"{radius:>8g}" + "".join(f"{curve[n]:>15.3f}" for curve in curves.values()))
 
 
-@contextmanager
-def _mask_of(instrument: str) -> Iterator[Path | None]:
-    """The mask image that the user's instrument file names, as a FITS file; None if it names no mask image."""
+def _mask_of(instrument: str, folder: str) -> Path | None:
+    """The mask image that the user's instrument file names, as a FITS file in this folder; None if it names no mask image."""
     if not instrument.endswith(".toml"):
-        yield None
-        return
+        return None
     from astropy.io import fits
 
     from psfcore.fits.images import read_mask_image
@@ -196,10 +192,7 @@ def _mask_of(instrument: str) -> Iterator[Path | None]:
 
     mount = load_instrument(instrument).mount
     if mount is None or mount.mask_image is None:
-        yield None
-        return
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "mask.fits"
-        mask = read_mask_image(Path(instrument).parent / mount.mask_image.file)
-        fits.PrimaryHDU(mask).writeto(path)
-        yield path
+        return None
+    file = Path(folder) / "mask.fits"
+    fits.PrimaryHDU(read_mask_image(Path(instrument).parent / mount.mask_image.file)).writeto(file)
+    return file
