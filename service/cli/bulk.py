@@ -26,8 +26,8 @@ from service.cli.connection import (
     whole_id,
 )
 from service.cli.jobs import MOST
-from service.cli.options import OUTPUT, Text, fits_files, options_of, progress_bar, write_file, writes_files
-from service.cli.progress import duration, echo, moment
+from service.cli.options import OUTPUT, Text, fits_files, options_of, write_file, writes_files
+from service.cli.progress import duration, echo, moment, progress_bar
 from service.client.errors import ServiceError
 from service.client.operations import treatment
 from workers.contract.requests import Treatment
@@ -163,9 +163,8 @@ def list_bulks(service: Client, most: int) -> None:
 @on_service
 def status(service: Client, bulk_id: str, wait: bool) -> None:
     """Show the progress, speed and time left of a bulk run. `bulk list` lists your bulk runs."""
-    if wait:
-        _wait(service, bulk_id)
-    _end(service.bulk(bulk_id), wait)
+    run = _wait(service, bulk_id) if wait else service.bulk(bulk_id)
+    _end(run, wait)
 
 
 def _add_action(action: str, short_help: str, text: str) -> None:

@@ -16,7 +16,7 @@ from click.shell_completion import CompletionItem
 from psfcore.errors import did_you_mean
 from psfcore.instruments.files import instrument_names
 from psfcore.published_psfs import PUBLISHED, kept_file
-from service.cli.options import options_of
+from service.cli.options import Command, options_of
 from service.cli.progress import echo, say
 from service.client.errors import DEFAULT_SERVER, SHOWN_DIGITS
 from service.client.operations import Operations
@@ -30,7 +30,6 @@ _KEY = "heliopsf.key"
 DIGITS = 64  # number of digits of a whole id, except ids of jobs and bulk runs
 _ID = re.compile(rf"[0-9a-f]{{{FEWEST_DIGITS},{DIGITS}}}")
 _DIGITS = f"{FEWEST_DIGITS} or more hexadecimal digits"
-Command = TypeVar("Command", bound=Callable[..., Any])
 Thing = TypeVar("Thing")
 Row = dict[str, Any]
 

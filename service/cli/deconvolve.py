@@ -26,11 +26,10 @@ from service.cli.options import (
     limits,
     methods_help,
     options_of,
-    progress_bar,
     say_warnings,
     write_json,
 )
-from service.cli.progress import Report, echo
+from service.cli.progress import Report, echo, progress_bar
 from service.client.errors import ServiceError
 from service.client.many import FOR_ALL, Outcome, deconvolve_many
 from service.client.operations import Operations

@@ -15,11 +15,10 @@ from service.cli.options import (
     OUTPUT_PLACE,
     PLOT,
     Place,
-    progress_bar,
     write_json,
     writes_files,
 )
-from service.cli.progress import duration, echo, moment, step_text
+from service.cli.progress import duration, echo, moment, progress_bar, step_text
 from service.client.errors import ServiceError
 from workers.contract.jobs import Phase
 

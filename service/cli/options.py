@@ -29,7 +29,6 @@ from psfcore.errors import DataError, missing_extra
 from psfcore.files import fits_in
 from psfcore.noise import NoiseFigures
 from service.cli.progress import echo
-from service.cli.progress import progress_bar as progress_bar
 from service.client.outputs import base_name, check_output_folder, check_outputs, written
 from workers.contract.requests import METHOD_MODELS, METHODS, Deconvolve, DefaultMethod, Option
 
@@ -228,9 +227,6 @@ class Place:
         self.path.mkdir(parents=True, exist_ok=True)
         return self.path / (base_name(name) or "result.fits")
 
-    def __str__(self) -> str:
-        return str(self.path)
-
 
 FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
@@ -281,34 +277,28 @@ def writes_files(command: Command) -> Command:
     @OVERWRITE
     @wraps(command)
     def checked(**given: Any) -> Any:
-        outputs, inputs = _files_of(click.get_current_context().command.params, given)
-        for place in given.values():
-            if isinstance(place, Place) and place.is_folder:
-                check_output_folder(place.path)
-        check_outputs(outputs, inputs=inputs, overwrite=given["overwrite"])
+        _check_files(click.get_current_context().command.params, given)
         return command(**given)
 
     return checked  # type: ignore[return-value]
 
 
-def _files_of(
-    parameters: Sequence[click.Parameter], given: dict[str, Any]
-) -> tuple[list[Path | None], list[Path]]:
-    """The files that a command writes, and the files and folders that it reads."""
+def _check_files(parameters: Sequence[click.Parameter], given: dict[str, Any]) -> None:
+    """Check that a command can write its files, and that it reads none of them. Raises ``ServiceError``."""
     outputs: list[Path | None] = []
     inputs: list[Path] = []
     for parameter in parameters:
         value = given.get(parameter.name or "")
-        if isinstance(parameter.type, OutputFile):
-            if isinstance(value, Place):
-                value = None if value.is_folder else value.path
-            outputs.append(value)
+        if isinstance(value, Place) and value.is_folder:
+            check_output_folder(value.path)
+        elif isinstance(parameter.type, OutputFile):
+            outputs.append(value.path if isinstance(value, Place) else value)
         elif not isinstance(parameter.type, OutputFolder):
             values = value if isinstance(value, tuple) else (value,)
             inputs += [one for one in values if isinstance(one, Path)]
             if "FILE" in (parameter.metavar or ""):  # such as ID|FILE
                 inputs += [Path(one) for one in values if isinstance(one, str) and Path(one).is_file()]
-    return outputs, inputs
+    check_outputs(outputs, inputs=inputs, overwrite=given["overwrite"])
 
 
 def check_fresh_folder(folder: Path, inputs: Sequence[Path] = (), *, overwrite: bool = False) -> None:

@@ -21,10 +21,9 @@ from service.cli.options import (
     OUTPUT_FOLDER,
     Text,
     check_fresh_folder,
-    progress_bar,
     read_settings,
 )
-from service.cli.progress import echo
+from service.cli.progress import echo, progress_bar
 from service.client.errors import WaitInterrupted
 from service.client.operations import Progress, without_none
 from service.client.outputs import check_outputs

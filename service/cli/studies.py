@@ -22,13 +22,12 @@ from service.cli.options import (
     SATURATION,
     Text,
     limits,
-    progress_bar,
     psf_limits,
     write_file,
     write_json,
     writes_files,
 )
-from service.cli.progress import echo
+from service.cli.progress import echo, progress_bar
 
 INSTRUMENT = click.option("--instrument", default="hri_euv", metavar="NAME|FILE",
                           help="A known instrument, or an instrument file (TOML)")  # fmt: skip

@@ -28,13 +28,12 @@ from service.cli.options import (
     SEED,
     limits,
     options_of,
-    progress_bar,
     write_file,
     write_json,
     writes_files,
 )
 from service.cli.progress import Report as Progress
-from service.cli.progress import echo, say
+from service.cli.progress import echo, progress_bar, say
 from service.client.operations import Operations
 from workers.contract.requests import GapDiagnose, Report
 

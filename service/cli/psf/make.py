@@ -16,12 +16,11 @@ from service.cli.options import (
     OUTPUT,
     PLOT,
     options_of,
-    progress_bar,
     psf_limits,
     write_file,
     writes_files,
 )
-from service.cli.progress import echo
+from service.cli.progress import echo, progress_bar
 from workers.contract.requests import CrossValidate, PsfBuild, PsfFit
 
 SHOWN_RADII_PX = (0.5, 1, 2, 5, 10, 11.5, 20, 50, 100, 200, 500, 1000)

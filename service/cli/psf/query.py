@@ -23,12 +23,11 @@ from service.cli.options import (
     FOLDER,
     JSON,
     OUTPUT,
-    progress_bar,
     psf_limits,
     write_json,
     writes_files,
 )
-from service.cli.progress import echo, moment
+from service.cli.progress import echo, moment, progress_bar
 from service.client.outputs import written
 from workers.machine import psf_cache, published_folder
 
