@@ -148,7 +148,7 @@ class Text(click.ParamType):
         self.read, self.name, self.keep = read, name, keep
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The value of a text; a default that is no text stays."""
+        """The value of a text."""
         try:
             read = self.read(str(value))
         except ValueError as error:
