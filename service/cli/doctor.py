@@ -17,7 +17,7 @@ from contextlib import closing
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import click
 from packaging.requirements import Requirement
@@ -38,7 +38,6 @@ from workers.machine import cores
 from workers.settings import Settings, software_version
 
 State = Literal["ok", "warning", "broken"]
-SIGNS: dict[State, str] = {"ok": "green", "warning": "yellow", "broken": "red"}
 PINS = Path(__file__).parents[2] / "constraints.txt"
 CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -118,11 +117,10 @@ def table(findings: dict[str, Finding], width: int) -> Iterator[str]:
     for what, finding in findings.items():
         texts = [finding.found, *([f"-> {finding.advice}"] if finding.advice else [])]
         lines = [line for text in texts for line in textwrap.wrap(text, max(40, width - len(indent)))]
-        state = click.style(finding.state, fg=SIGNS[finding.state]) + " " * (7 - len(finding.state))
-        yield f"{what:<{names}}  {state}  {lines[0]}"
+        yield f"{what:<{names}}  {finding.state:<7}  {lines[0]}"
         yield from (indent + line for line in lines[1:])
     count = Counter(finding.state for finding in findings.values())
-    yield ", ".join(f"{count[state]} {state}" for state in SIGNS if count[state])
+    yield ", ".join(f"{count[state]} {state}" for state in get_args(State) if count[state])
 
 
 # The checks ----------------------------------------------------------------------------------
