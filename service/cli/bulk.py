@@ -25,12 +25,11 @@ from service.cli.connection import (
     short,
     whole_id,
 )
-from service.cli.jobs import MOST, moment
-from service.cli.options import OUTPUT, fits_files, options_of, progress_bar, writes_files
-from service.cli.progress import duration, echo
+from service.cli.jobs import MOST
+from service.cli.options import OUTPUT, Text, fits_files, options_of, write_file, writes_files
+from service.cli.progress import duration, echo, moment, progress_bar
 from service.client.errors import ServiceError
 from service.client.operations import treatment
-from service.client.outputs import written
 from workers.contract.requests import Treatment
 from workers.versions import PsfStatus
 
@@ -46,17 +45,12 @@ WAIT = click.option(
 )
 
 
-class _Condition(click.ParamType):
-    name = "condition"
-
-    def convert(
-        self, value: object, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[str, str, Any]:
-        """Split a text such as WAVELNTH=174 into keyword, comparison sign and value."""
-        parts = _CONDITION.fullmatch(str(value).strip())
-        if parts is None:
-            self.fail(f"expected KEYWORD=VALUE, or != < <= > >= instead of =; got {value!r}", param, ctx)
-        return parts[1], parts[2], _value(parts[3])
+def _condition(text: str) -> tuple[str, str, Any]:
+    """Keyword, comparison sign and value of a text such as WAVELNTH=174."""
+    parts = _CONDITION.fullmatch(text.strip())
+    if parts is None:
+        raise ValueError(f"expected KEYWORD=VALUE, or != < <= > >= instead of =; got {text!r}")
+    return parts[1], parts[2], _value(parts[3])
 
 
 @click.group(short_help="Deconvolve many images on a service.")
@@ -72,7 +66,7 @@ def bulk() -> None:
               help="FITS file, or folder of FITS files, to upload and deconvolve; can be repeated")  # fmt: skip
 @click.option("--image", "images", multiple=True, type=ID, metavar="ID",
               help="Id of an uploaded image; can be repeated")  # fmt: skip
-@click.option("--where", "conditions", multiple=True, type=_Condition(), metavar="KEYWORD=VALUE",
+@click.option("--where", "conditions", multiple=True, type=Text(_condition), metavar="KEYWORD=VALUE",
               help="Use only files whose header meets this condition; several conditions must all be met")  # fmt: skip
 @click.option("--output", help="Write products to this folder on the machine of the service")
 @click.option(
@@ -169,9 +163,8 @@ def list_bulks(service: Client, most: int) -> None:
 @on_service
 def status(service: Client, bulk_id: str, wait: bool) -> None:
     """Show the progress, speed and time left of a bulk run. `bulk list` lists your bulk runs."""
-    if wait:
-        _wait(service, bulk_id)
-    _end(service.bulk(bulk_id), wait)
+    run = _wait(service, bulk_id) if wait else service.bulk(bulk_id)
+    _end(run, wait)
 
 
 def _add_action(action: str, short_help: str, text: str) -> None:
@@ -232,8 +225,8 @@ def report(
         service.write_bulk_manifest(bulk_id, output, format=form, overwrite=overwrite)
         echo(str(output))
     if failures is not None:
-        with written(failures, overwrite=overwrite) as partial:
-            partial.write_text("".join(f"{json.dumps(row)}\n" for row in failed), "utf-8")
+        lines = "".join(f"{json.dumps(row)}\n" for row in failed)
+        write_file(failures, lambda file: file.write_text(lines, "utf-8"), overwrite=overwrite)
         echo(str(failures))
 
 

@@ -16,7 +16,7 @@ from click.shell_completion import CompletionItem
 from psfcore.errors import did_you_mean
 from psfcore.instruments.files import instrument_names
 from psfcore.published_psfs import PUBLISHED, kept_file
-from service.cli.options import LOCAL, is_local, kept, options_of, user_errors
+from service.cli.options import LOCAL, Command, is_local, kept, options_of
 from service.cli.progress import echo, say
 from service.client.errors import DEFAULT_SERVER, SHOWN_DIGITS
 from service.client.operations import Operations
@@ -31,7 +31,7 @@ CHOSEN_SERVER = "heliopsf.server"  # where the context of a command has the addr
 DIGITS = 64  # number of digits of a whole id, except ids of jobs and bulk runs
 _ID = re.compile(rf"[0-9a-f]{{{FEWEST_DIGITS},{DIGITS}}}")
 _DIGITS = f"{FEWEST_DIGITS} or more hexadecimal digits"
-Command = TypeVar("Command", bound=Callable[..., Any])
+Thing = TypeVar("Thing")
 Row = dict[str, Any]
 
 
@@ -51,15 +51,13 @@ class _Id(click.ParamType):
             return text
         if _ID.fullmatch(text.lower()):
             return text.lower()
-        if not self.or_instrument:
-            expected = f"a PSF id ({_DIGITS}) or a file" if self.or_file else f"an id, or its first {_DIGITS}"
-            self.fail(f"expected {expected}; got {value!r}", param, ctx)
-        names = [*instrument_names(), *PUBLISHED]
+        names = [*instrument_names(), *PUBLISHED] if self.or_instrument else []
         if text in names:
             return text
-        meant = did_you_mean(text, names)
-        expected = f"a file, the name of an instrument or of a published PSF, or a PSF id ({_DIGITS})"
-        self.fail(f"expected {expected}; got {value!r}{meant}", param, ctx)
+        expected = f"a PSF id ({_DIGITS}) or a file" if self.or_file else f"an id, or its first {_DIGITS}"
+        if self.or_instrument:
+            expected = f"a file, the name of an instrument or of a published PSF, or a PSF id ({_DIGITS})"
+        self.fail(f"expected {expected}; got {value!r}{did_you_mean(text, names)}", param, ctx)
 
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
@@ -139,13 +137,13 @@ def on_service(command: Command) -> Command:
     @SERVER
     @wraps(command)
     def connected(**given: Any) -> Any:
-        with user_errors(), remote() as service:
+        with remote() as service:
             return command(service=service, **given)
 
     return connected  # type: ignore[return-value]
 
 
-def print_rows(rows: Iterable[Row], line: Callable[[Row], str], *, if_none: str) -> None:
+def print_rows(rows: Iterable[Thing], line: Callable[[Thing], str], *, if_none: str) -> None:
     """Print a line for each row of a list. if_none: what to print if there are no rows."""
     lines = [line(row).rstrip() for row in rows]
     echo("\n".join(lines or [if_none]))

@@ -27,14 +27,12 @@ from service.cli.options import (
     limits,
     methods_help,
     options_of,
-    progress_bar,
     say_warnings,
-    user_errors,
     write_json,
 )
-from service.cli.progress import Report, echo
+from service.cli.progress import Report, echo, progress_bar
 from service.client.errors import ServiceError
-from service.client.many import Outcome, deconvolve_many
+from service.client.many import FOR_ALL, Outcome, deconvolve_many
 from service.client.operations import Operations
 from service.client.outputs import check_output_folder, check_outputs, written
 from service.start import STARTED
@@ -53,8 +51,6 @@ OPTIONS = (
 
 TABLE, SHEET = "changes.json", "contact-sheet.png"
 SHOWN = 20
-# These errors concern every image, so the command stops.
-FOR_ALL = (401, 403)
 
 
 @click.command(epilog=methods_help())
@@ -88,9 +84,7 @@ def deconvolve(
 
     The output is a folder for several images, or if its name ends in /. Images whose product is in the folder are skipped.
     """
-    files = fits_files(images)
-    if not files:
-        raise click.UsageError("expected FITS files; the folders that you named contain none")
+    files = _fits_files(images)
     if timings and not is_local():
         raise click.UsageError(
             "--timings: expected --local, because a service measures the stages of all jobs together; see its /metrics"
@@ -100,14 +94,12 @@ def deconvolve(
         raise click.UsageError(
             "--plot and --changes: expected one image and an output file; for several images use `heliopsf changes`"
         )
-    with user_errors():
-        psf_files = [Path(psf)] if psf and Path(psf).is_file() else []
-        if into_folder:
-            check_output_folder(output.path)
-        else:
-            check_outputs((output.path, plot, changes), inputs=[*files, *psf_files], overwrite=overwrite)
+    psf_files = [Path(psf)] if psf and Path(psf).is_file() else []
+    if into_folder:
+        check_output_folder(output.path)
+    else:
+        check_outputs((output.path, plot, changes), inputs=[*files, *psf_files], overwrite=overwrite)
     with (
-        user_errors(),
         connection() as service,
         progress_bar() as report,
     ):
@@ -124,6 +116,13 @@ def deconvolve(
         raise click.ClickException(
             f"{len(failures)} of {counted(len(files), 'image')} failed; see the list above"
         )
+
+
+def _fits_files(images: tuple[Path, ...]) -> list[Path]:
+    files = fits_files(images)
+    if not files:
+        raise click.UsageError("expected FITS files; the folders that you named contain none")
+    return files
 
 
 def _timings(service: Operations) -> list[str]:
@@ -211,16 +210,13 @@ def changes(
     """
     from psfcore.deconvolve.assess.pictures import contact_sheet_png, table, treat_many
 
-    files = [str(path) for path in fits_files(images)]
-    if not files:
-        raise click.UsageError("expected FITS files; the folders that you named contain none")
+    files = [str(path) for path in _fits_files(images)]
     table_file, sheet_file = output / TABLE, output / SHEET
-    with user_errors():
-        check_output_folder(output)
-        if output.is_dir():
-            psf_file = psf if psf and Path(psf).is_file() else None
-            check_outputs((table_file, sheet_file), inputs=(*files, psf_file), overwrite=overwrite)
-    with user_errors(), connection() as service, progress_bar() as report:
+    check_output_folder(output)
+    if output.is_dir():
+        psf_file = psf if psf and Path(psf).is_file() else None
+        check_outputs((table_file, sheet_file), inputs=(*files, psf_file), overwrite=overwrite)
+    with connection() as service, progress_bar() as report:
         parameters["psf_id"] = named_psf(service, psf)
         products: dict[str, dict[str, Any]] = {}
         treated, failures = treat_many(

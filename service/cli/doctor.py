@@ -13,17 +13,16 @@ import textwrap
 import time
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
-from typing import Literal
-from urllib.parse import urlsplit
+from typing import Literal, get_args
 
 import click
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
-from sqlalchemy.engine import make_url
+from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
 from psfcore import limited
@@ -39,10 +38,11 @@ from workers.machine import cores
 from workers.settings import Settings, software_version
 
 State = Literal["ok", "warning", "broken"]
-SIGNS: dict[State, str] = {"ok": "green", "warning": "yellow", "broken": "red"}
 PINS = Path(__file__).parents[2] / "constraints.txt"
 CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 EXTRAS = ("service", "published", "plot")  # the commands need all packages of these extras
+HIDDEN = "the URL that is set"  # in place of a URL that may contain a password in any part
 LITTLE_ROOM_BYTES = 5 * 2**30
 # The first patch of each Python that reads long cookies (CVE-2024-7592) and headers of tar files (CVE-2024-6232) in linear time.
 LINEAR_PYTHONS = {(3, 11): 10, (3, 12): 6}
@@ -96,9 +96,10 @@ def examine(settings: Settings) -> dict[str, Finding]:
     if settings.store_url:
         findings["object store"] = object_store(settings)
     findings["broker"] = broker(settings)
-    with _catalogue(settings) as (catalogue, findings["database"]):
-        if catalogue is None:
-            return findings
+    findings["database"] = database(settings)
+    if findings["database"].state != "ok":
+        return findings
+    with closing(Catalogue(settings.catalogue_url)) as catalogue:
         for check in (schema, changes, clock, workers, stuck_jobs):
             name = check.__name__.replace("_", " ")
             try:
@@ -116,11 +117,10 @@ def table(findings: dict[str, Finding], width: int) -> Iterator[str]:
     for what, finding in findings.items():
         texts = [finding.found, *([f"-> {finding.advice}"] if finding.advice else [])]
         lines = [line for text in texts for line in textwrap.wrap(text, max(40, width - len(indent)))]
-        state = click.style(finding.state, fg=SIGNS[finding.state]) + " " * (7 - len(finding.state))
-        yield f"{what:<{names}}  {state}  {lines[0]}"
+        yield f"{what:<{names}}  {finding.state:<7}  {lines[0]}"
         yield from (indent + line for line in lines[1:])
     count = Counter(finding.state for finding in findings.values())
-    yield ", ".join(f"{count[state]} {state}" for state in SIGNS if count[state])
+    yield ", ".join(f"{count[state]} {state}" for state in get_args(State) if count[state])
 
 
 # The checks ----------------------------------------------------------------------------------
@@ -128,12 +128,9 @@ def table(findings: dict[str, Finding], width: int) -> Iterator[str]:
 
 def versions(pins: Path = PINS) -> Finding:
     """Do the installed libraries have the required versions, and (if constraints.txt is here) the tested versions?"""
-    wrong, other, count = [], [], 0
-    tested = _pinned(pins)
-    for requirement in map(Requirement, requires("heliopsf") or []):
-        if requirement.name == "heliopsf" or not _is_needed(requirement):
-            continue
-        count += 1
+    wrong, other, tested = [], [], _pinned(pins)
+    libraries = [one for one in map(Requirement, requires("heliopsf") or []) if _is_needed(one)]
+    for requirement in libraries:
         try:
             found = version(requirement.name)
         except PackageNotFoundError:
@@ -152,7 +149,7 @@ def versions(pins: Path = PINS) -> Finding:
         return Finding("warning", f"{about}; {'; '.join(other)}", advice)
     kind = "tested" if tested else "required"
     note = "" if tested else " (there is no constraints.txt with tested versions here)"
-    return Finding("ok", f"{about}; {count} libraries with {kind} versions{note}")
+    return Finding("ok", f"{about}; {len(libraries)} libraries with {kind} versions{note}")
 
 
 def python(release: tuple[int, int, int] = sys.version_info[:3]) -> Finding:
@@ -178,14 +175,11 @@ def threads(settings: Settings, cpu_quota: Path = CPU_QUOTA) -> Finding:
     found = f"{here} cores, {processes} worker process{'es' if processes > 1 else ''} of {settings.threads} threads"
     if may_use < here:
         found += f"; the container may use {may_use:g} of the cores"
+    values = {name: os.environ[name] for name in THREAD_VARIABLES if name in os.environ}
+    found += "".join(f"; {name}={value}" for name, value in values.items())
+    values.pop("NUMBA_NUM_THREADS", None)  # a worker sets this variable by itself
     advice = []
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        value = os.environ.get(name)
-        if value is None:
-            continue
-        found += f"; {name}={value}"
-        if name == "NUMBA_NUM_THREADS":  # a worker sets this variable by itself
-            continue
+    for name, value in values.items():
         first = value.split(",")[0].strip()
         if not first.isdecimal() or int(first) < 1:
             advice.append(f"set {name} to a number of threads")
@@ -281,6 +275,33 @@ def broker(settings: Settings) -> Finding:
     return Finding("ok", f"{where} answers")
 
 
+def database(settings: Settings) -> Finding:
+    """Does the database answer, and is the file of an SQLite database whole?"""
+    where = address(settings.catalogue_url)
+    own = settings.catalogue_url.startswith("sqlite") and where != HIDDEN
+    if own and not Path(where).exists():  # opening the database would create the file
+        return Finding("warning", f"{where} does not exist yet", "`heliopsf serve` makes it")
+    try:
+        catalogue = Catalogue(settings.catalogue_url)
+    except (ArgumentError, ImportError, ValueError) as error:
+        advice = "set HELIOPSF_DATABASE_URL to postgresql://..., or unset it"
+        return Finding("broken", f"{where} cannot be used ({type(error).__name__})", advice)
+    started = time.perf_counter()
+    try:
+        with closing(catalogue):
+            catalogue.ping()
+            took_ms = 1e3 * (time.perf_counter() - started)
+            catalogue.check_pages()
+    except SQLAlchemyError as error:
+        advice = (
+            "correct the permissions of the file" if own else "start it, or correct HELIOPSF_DATABASE_URL"
+        )
+        if checks.damaged(error):
+            advice = "stop the service, and restore a copy of the database"
+        return Finding("broken", f"{where}: {checks.database_said(error)}", advice)
+    return Finding("ok", f"{where} answers in {took_ms:.0f} ms")
+
+
 def schema(_settings: Settings, catalogue: Catalogue) -> Finding:
     """Is the database at the revision that this version needs, and complete?"""
     status = catalogue.schema.status()
@@ -364,58 +385,18 @@ def stuck_jobs(settings: Settings, catalogue: Catalogue) -> Finding:
 
 
 def address(url: str) -> str:
-    """Scheme, host, port and path of a URL, without user, password and options."""
+    """The file of a URL of SQLite; of another URL scheme, host, port and path, without user, password and options."""
     try:
-        parts = urlsplit(url)
-        where = f"{parts.hostname}:{parts.port}" if parts.port else parts.hostname or ""
-    except ValueError:
-        return "the URL that is set"
-    # A text that is not a URL may contain a password in any part. A / in a password ends the host part too early.
-    beyond = parts.path + parts.query + parts.fragment
-    if "@" in beyond or not (parts.hostname or parts.scheme.startswith("sqlite")):
-        return "the URL that is set"
-    return f"{parts.scheme}://{where}{parts.path}"
-
-
-@contextmanager
-def _catalogue(settings: Settings) -> Iterator[tuple[Catalogue | None, Finding]]:
-    """The catalogue (None if the database does not answer), and the finding about the database."""
-    where, own = _database(settings)
-    if own and not Path(where).exists():  # opening the database would create the file
-        yield None, Finding("warning", f"{where} does not exist yet", "`heliopsf serve` makes it")
-        return
-    advice = "correct the permissions of the file" if own else "start it, or correct HELIOPSF_DATABASE_URL"
-    try:
-        catalogue = Catalogue(settings.catalogue_url)
-    except (ArgumentError, ImportError, ValueError) as error:
-        found = f"{where} cannot be used ({type(error).__name__})"
-        advice = "set HELIOPSF_DATABASE_URL to postgresql://..., or unset it"
-        yield None, Finding("broken", found, advice)
-        return
-    try:
-        started = time.perf_counter()
-        catalogue.ping()
-        took_ms = 1e3 * (time.perf_counter() - started)
-        catalogue.check_pages()
-    except SQLAlchemyError as error:
-        if checks.damaged(error):
-            advice = "stop the service, and restore a copy of the database"
-        yield None, Finding("broken", f"{where}: {checks.database_said(error)}", advice)
-    else:
-        yield catalogue, Finding("ok", f"{where} answers in {took_ms:.0f} ms")
-    finally:
-        catalogue.close()
-
-
-def _database(settings: Settings) -> tuple[str, bool]:
-    """Address of the database, and whether it is a file of SQLite."""
-    try:
-        url = make_url(settings.catalogue_url)
+        parts = make_url(url)
     except (ArgumentError, ValueError):
-        url = None
-    if url is not None and url.get_backend_name() == "sqlite" and url.database:
-        return url.database, True
-    return address(settings.catalogue_url), False
+        return HIDDEN
+    if parts.get_backend_name() == "sqlite" and parts.database:
+        return parts.database
+    # A password that is not encoded may reach into the parts behind it.
+    if parts.host is None or "@" in f"{parts.host}{parts.database}":
+        return HIDDEN
+    public = URL.create(parts.drivername, host=parts.host, port=parts.port, database=parts.database)
+    return public.render_as_string()
 
 
 def _start(settings: Settings) -> str:
@@ -424,8 +405,9 @@ def _start(settings: Settings) -> str:
 
 def _is_needed(requirement: Requirement) -> bool:
     """Whether the commands and the service need a library: it is required always, or by one of their extras."""
-    return requirement.marker is None or any(
-        requirement.marker.evaluate({"extra": extra}) for extra in ("", *EXTRAS)
+    return requirement.name != "heliopsf" and (
+        requirement.marker is None
+        or any(requirement.marker.evaluate({"extra": extra}) for extra in ("", *EXTRAS))
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,11 +24,10 @@ from service.cli.options import (
     OUTPUT_PLACE,
     PLOT,
     Place,
-    progress_bar,
     write_json,
     writes_files,
 )
-from service.cli.progress import duration, echo, step_text
+from service.cli.progress import duration, echo, moment, progress_bar, step_text
 from service.client.errors import ServiceError
 from workers.contract.jobs import Phase
 
@@ -191,11 +189,6 @@ def delete(service: Client, identities: tuple[str, ...]) -> None:
         whole = whole_id(service, "products", identity)
         service.delete_product(whole)
         echo(f"product {short(whole)} is deleted")
-
-
-def moment(seconds: float) -> str:
-    """A time as text, in UTC."""
-    return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M:%SZ")
 
 
 def _state(row: Row) -> str:

@@ -33,7 +33,7 @@ from psfcore.instruments.model import parse_instrument
 from psfcore.instruments.unknown import unknown_instrument
 from psfcore.instruments.workload import check_workload
 from psfcore.transit.archive import list_archive, transit_in
-from service.cli.local_workspace import Files, ImageFile, Inputs, LocalWorkspace, PsfFile, TransitFiles
+from service.cli.local_workspace import ImageFile, Inputs, LocalWorkspace, PsfFile, TransitFiles, states_of
 from service.client.errors import ServiceError
 from service.client.operations import Operations, Progress, named_instrument
 from service.client.outputs import written
@@ -81,29 +81,28 @@ class Local(Operations):
         summary = read_summary(path, LIMITS)
         if summary.codec is not None:
             limited.prepare()
-        files = Files(Path(path))
-        image = ImageFile(Path(path), files, sha256_of(Path(path)), summary)
+        states = states_of(Path(path))
+        image = ImageFile(Path(path), states, sha256_of(Path(path)), summary)
         self.inputs.images[image.sha256] = image
         return {"id": image.sha256}
 
     def image_id(self, path: str | Path, sha256: str) -> str:
         """Add an image; returns its id."""
-        identity: str = self.upload_image(path)["id"]
-        return identity
+        return str(self.upload_image(path)["id"])
 
     def upload_transit(self, path: str | Path) -> dict[str, Any]:
         """Add a transit, after the same check of its table of contents as in a service."""
         path = Path(path)
         if path.is_dir():
             path = path.resolve()
-            files = Files(*(file for file in path.iterdir() if file.is_file()))
+            states = states_of(*(file for file in path.iterdir() if file.is_file()))
             found = transit_in(path)
-            files = files.only(path / name for name in found.contents.files)
-            transit = TransitFiles(path, files, found.sha256, found.bytes, found.contents)
+            states = {path / name: states[path / name] for name in found.contents.files}
+            transit = TransitFiles(path, states, found.sha256, found.contents)
         else:
-            files = Files(path)
+            states = states_of(path)
             contents = list_archive(path, self._settings.archive_limits)
-            transit = TransitFiles(path, files, sha256_of(path), path.stat().st_size, contents)
+            transit = TransitFiles(path, states, sha256_of(path), contents)
         self.inputs.transits[transit.sha256] = transit
         return {"id": transit.sha256}
 
@@ -113,11 +112,11 @@ class Local(Operations):
         path = Path(path)
         summary = read_summary(path, LIMITS)
         check_no_product(summary)
-        files = Files(path)
+        states = states_of(path)
         sha256 = sha256_of(path)
         identity = stated_id(path, LIMITS) or sha256
         named = name_of_upload(summary, path.name, sha256)
-        self.inputs.psfs[identity] = PsfFile(path, files, sha256, summary, *named)
+        self.inputs.psfs[identity] = PsfFile(path, states, sha256, summary, *named)
         self._workspace(identity).psf(identity, parts=False)
         return {"id": identity}
 

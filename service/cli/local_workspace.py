@@ -4,7 +4,7 @@ files are written when the command asks for them."""
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -38,26 +38,22 @@ if TYPE_CHECKING:
     from psfcore.recipe import Recipe
 
 
-class Files:
-    """Files of the user. ``check`` raises OSError if one of them has changed since it was added."""
+States = dict[Path, tuple[int, int]]  # time of the last change (ns) and size (bytes) of the user's files
 
-    def __init__(self, *files: Path) -> None:
-        self._seen = {file: _state(file) for file in files}
 
-    def only(self, files: Iterable[Path]) -> Files:
-        """Some of these files, with the state that was recorded first."""
-        some = Files()
-        some._seen = {file: self._seen[file] for file in files}
-        return some
+def states_of(*files: Path) -> States:
+    """The present states of files."""
+    return {file: _state(file) for file in files}
 
-    def check(self) -> None:
-        for file, state in self._seen.items():
-            if _state(file) != state:
-                raise OSError(f"{file} changed while it was read; run the command again")
+
+def check_unchanged(states: States) -> None:
+    """Raise OSError if one of the files has changed since its state was recorded."""
+    for file, state in states.items():
+        if _state(file) != state:
+            raise OSError(f"{file} changed while it was read; run the command again")
 
 
 def _state(file: Path) -> tuple[int, int]:
-    """Time of the last change (ns) and size (bytes) of a file."""
     return (found := file.stat()).st_mtime_ns, found.st_size
 
 
@@ -66,7 +62,7 @@ class ImageFile:
     """An image in a file."""
 
     path: Path
-    files: Files
+    states: States
     sha256: str
     summary: HeaderSummary
 
@@ -100,18 +96,17 @@ class TransitFiles:
     """A transit in a folder or in an archive."""
 
     path: Path
-    files: Files
+    states: States
     sha256: str
-    bytes: int
     contents: ArchiveContents
 
     @contextmanager
     def folder(self) -> Iterator[Path]:
         """A folder with its files: the user's own, or a temporary one with the files of the archive."""
-        self.files.check()
+        check_unchanged(self.states)
         if self.path.is_dir():
             yield self.path
-            self.files.check()
+            check_unchanged(self.states)
             return
         with TemporaryDirectory(prefix="heliopsf-") as folder:
             unpack(self.path, folder, Settings.apart(Path(folder)).archive_limits)
@@ -160,12 +155,12 @@ class LocalWorkspace(Workspace):
     def add(self, result: Result) -> None:
         image = self.inputs.images.get(result.columns.get("image_id", ""))
         if image is not None:
-            image.files.check()
+            check_unchanged(image.states)
         self.inputs.results[result.type, result.id] = result
 
     def image_file(self, identity: str) -> Path:
         image = self.inputs.images[identity]
-        image.files.check()
+        check_unchanged(image.states)
         return image.path
 
     def summary(self, request: Deconvolve | ResolvedDeconvolve) -> HeaderSummary:
@@ -201,7 +196,7 @@ class LocalWorkspace(Workspace):
         if build is not None:
             psf = self._kept(recipe_of(build), parts=False)
         elif named is not None:
-            named.files.check()
+            check_unchanged(named.states)
             psf = named.seen_as(read_psf(named.path, LIMITS, parts=parts))
         else:
             raise no_such("psf", identity)

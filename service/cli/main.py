@@ -4,19 +4,22 @@ is called, so that ``heliopsf --version`` is fast.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import errno
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from difflib import get_close_matches
 from typing import Any, NamedTuple
 
 import click
 from click.shell_completion import CompletionItem
 
-from psfcore.errors import MissingExtra, missing_extra, module_of_extra
+from psfcore.errors import DataError, MissingExtra, missing_extra, module_of_extra
 from service.cli.progress import echo, printable
-from service.client.errors import DEFAULT_SERVER, SHOWN_DIGITS, WaitInterrupted
+from service.client.errors import DEFAULT_SERVER, SHOWN_DIGITS, ServiceError, WaitInterrupted, error_lines
 
 INTERRUPTED = 130  # exit status of a command that was ended by Control-C: 128 + the number of SIGINT
 REJOIN = {"job": "heliopsf job wait {id}", "bulk": "heliopsf bulk status {id} --wait"}
+NO_KEY = "this service needs a key: set HELIOPSF_KEY to your key (the operator makes keys with `heliopsf key create`)"
 _FETCH = "                      it prints the command that writes the result, such as heliopsf product get ID -o FILE\n"
 
 
@@ -75,20 +78,14 @@ class LazyGroup(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         """Run a command. Control-C ends it with status 130; if its job continues, a message says how to return to the job.
 
-        The message of an error may contain texts of a service or a file; it is made printable. If a package is missing, the
-        message names the extra that installs it.
+        The message of an error may contain texts of a service or a file; it is made printable.
         """
         try:
-            return super().invoke(ctx)
+            with user_errors():
+                return super().invoke(ctx)
         except click.ClickException as error:
             error.message = printable(error.message)  # type: ignore[misc]  # click declares it final
             raise
-        except ImportError as error:
-            missing = missing_extra(error) if isinstance(error, ModuleNotFoundError) else error
-            if not isinstance(missing, MissingExtra):
-                raise
-            local = "; or add --local, if the command has it" if missing.name == "httpx" else ""
-            raise click.ClickException(f"{missing}{local}") from error
         except KeyboardInterrupt as stop:
             echo(_interrupted(stop), err=True)
             ctx.exit(INTERRUPTED)
@@ -99,6 +96,31 @@ class LazyGroup(click.Group):
         for heading, rows in self.sections.items():
             with formatter.section(heading):
                 formatter.write_dl([(f"{name:<{width}}", row.summary) for name, row in rows.items()])
+
+
+@contextmanager
+def user_errors() -> Iterator[None]:
+    """Turn an error of the user's data, files, packages or service into text and an exit status, without a traceback.
+
+    If a package is missing, the text names the extra that installs it.
+    """
+    try:
+        yield
+    except DataError as error:  # of this process
+        raise click.ClickException("\n".join(error_lines(error.message, error.fields, local=True))) from error
+    except ServiceError as error:
+        message = NO_KEY if error.code == "no-key" else str(error)
+        raise click.ClickException("\n".join(error_lines(message, error.fields, local=False))) from error
+    except ImportError as error:
+        missing = missing_extra(error) if isinstance(error, ModuleNotFoundError) else error
+        if not isinstance(missing, MissingExtra):
+            raise
+        local = "; or add --local, if the command has it" if missing.name == "httpx" else ""
+        raise click.ClickException(f"{missing}{local}") from error
+    except OSError as error:
+        if error.errno == errno.EPIPE:  # the reader of the output ended first; click ends the command
+            raise
+        raise click.ClickException(str(error)) from error
 
 
 def _interrupted(stop: KeyboardInterrupt) -> str:

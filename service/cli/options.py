@@ -1,4 +1,4 @@
-"""What commands share: options, settings, errors in one line, and output files.
+"""What commands share: options, settings, and output files.
 
 Most options are made from the fields of the requests: name, type, limits, default and help text. A command names the fields that
 it offers and passes their values on as they are. A new field therefore needs no further declaration:
@@ -12,8 +12,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import wraps
 from importlib.util import find_spec
@@ -30,8 +29,6 @@ from psfcore.errors import DataError, missing_extra
 from psfcore.files import fits_in
 from psfcore.noise import NoiseFigures
 from service.cli.progress import echo
-from service.cli.progress import progress_bar as progress_bar
-from service.client.errors import ServiceError, error_lines
 from service.client.outputs import base_name, check_output_folder, check_outputs, written
 from workers.contract.requests import METHOD_MODELS, METHODS, Deconvolve, DefaultMethod, Option
 
@@ -97,11 +94,10 @@ def _option(model: type[BaseModel], name: str) -> Callable[[Command], Command]:
     default = None if name in DefaultMethod.model_fields else field.default
     return click.option(
         *names,
-        type=_type(kind, field),
+        type=_type(kind, field) if about.check is None else Text(about.check, keep=True),
         metavar=about.metavar,
         default=default,
         show_default=bool(default),
-        callback=None if about.check is None else _checked_by(about.check),
         help=text,
     )
 
@@ -142,16 +138,22 @@ def _type(kind: Any, field: FieldInfo) -> click.ParamType:
     return click.IntRange(**limits) if kind is int else click.FloatRange(**limits)
 
 
-def _checked_by(check: Callable[[str], object]) -> Callable[..., str | None]:
-    def checked(context: click.Context, parameter: click.Parameter, text: str | None) -> str | None:
-        if text is not None:
-            try:
-                check(text)
-            except DataError as error:
-                raise click.BadParameter(error.message, context, parameter) from error
-        return text
+class Text(click.ParamType):
+    """The type of an option whose text a function reads. A ``DataError`` or ValueError of the function becomes a usage error.
 
-    return checked
+    The value of the option is what the function returns; with ``keep`` it is the text.
+    """
+
+    def __init__(self, read: Callable[[str], object], *, name: str = "text", keep: bool = False) -> None:
+        self.read, self.name, self.keep = read, name, keep
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The value of a text."""
+        try:
+            read = self.read(str(value))
+        except ValueError as error:
+            self.fail(error.message if isinstance(error, DataError) else str(error), param, ctx)
+        return value if self.keep else read
 
 
 def _help(model: type[BaseModel], field: FieldInfo) -> str:
@@ -225,9 +227,6 @@ class Place:
         self.path.mkdir(parents=True, exist_ok=True)
         return self.path / (base_name(name) or "result.fits")
 
-    def __str__(self) -> str:
-        return str(self.path)
-
 
 FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
@@ -262,9 +261,6 @@ DATA = click.option(
 )
 OVERWRITE = click.option("--overwrite", is_flag=True, help="Replace output files that exist")
 
-NO_KEY = "this service needs a key: set HELIOPSF_KEY to your key (the operator makes keys with `heliopsf key create`)"
-
-
 LOCAL = "heliopsf.local"
 
 
@@ -280,19 +276,6 @@ def is_local() -> bool:
     """Whether the command has the option ``--local``."""
     context = click.get_current_context(silent=True)
     return context is not None and bool(context.meta.get(LOCAL))
-
-
-@contextmanager
-def user_errors() -> Iterator[None]:
-    """Turn an error of the user's data, files or service into text and an exit status, without a traceback."""
-    try:
-        yield
-    except (DataError, ServiceError) as error:
-        message = error.message if isinstance(error, DataError) else str(error)
-        message = NO_KEY if error.code == "no-key" else message
-        raise click.ClickException("\n".join(error_lines(message, error.fields, local=is_local()))) from error
-    except OSError as error:
-        raise click.ClickException(str(error)) from error
 
 
 def say_warnings(product: dict[str, Any]) -> None:
@@ -311,35 +294,28 @@ def writes_files(command: Command) -> Command:
     @OVERWRITE
     @wraps(command)
     def checked(**given: Any) -> Any:
-        outputs, inputs = _files_of(click.get_current_context().command.params, given)
-        with user_errors():
-            for place in given.values():
-                if isinstance(place, Place) and place.is_folder:
-                    check_output_folder(place.path)
-            check_outputs(outputs, inputs=inputs, overwrite=given["overwrite"])
+        _check_files(click.get_current_context().command.params, given)
         return command(**given)
 
     return checked  # type: ignore[return-value]
 
 
-def _files_of(
-    parameters: Sequence[click.Parameter], given: dict[str, Any]
-) -> tuple[list[Path | None], list[Path]]:
-    """The files that a command writes, and the files and folders that it reads."""
+def _check_files(parameters: Sequence[click.Parameter], given: dict[str, Any]) -> None:
+    """Check that a command can write its files, and that it reads none of them. Raises ``ServiceError``."""
     outputs: list[Path | None] = []
     inputs: list[Path] = []
     for parameter in parameters:
         value = given.get(parameter.name or "")
-        if isinstance(parameter.type, OutputFile):
-            if isinstance(value, Place):
-                value = None if value.is_folder else value.path
-            outputs.append(value)
+        if isinstance(value, Place) and value.is_folder:
+            check_output_folder(value.path)
+        elif isinstance(parameter.type, OutputFile):
+            outputs.append(value.path if isinstance(value, Place) else value)
         elif not isinstance(parameter.type, OutputFolder):
             values = value if isinstance(value, tuple) else (value,)
             inputs += [one for one in values if isinstance(one, Path)]
             if "FILE" in (parameter.metavar or ""):  # such as ID|FILE
                 inputs += [Path(one) for one in values if isinstance(one, str) and Path(one).is_file()]
-    return outputs, inputs
+    check_outputs(outputs, inputs=inputs, overwrite=given["overwrite"])
 
 
 def check_fresh_folder(folder: Path, inputs: Sequence[Path] = (), *, overwrite: bool = False) -> None:
@@ -355,8 +331,7 @@ def check_fresh_folder(folder: Path, inputs: Sequence[Path] = (), *, overwrite: 
     parent = folder.resolve().parent
     if not parent.is_dir():
         raise click.ClickException(f"cannot write {folder}: there is no folder {parent}")
-    with user_errors():
-        check_output_folder(folder)
+    check_output_folder(folder)
 
 
 def write_json(path: Path | None, content: dict[str, Any], *, overwrite: bool = False) -> None:
@@ -367,9 +342,9 @@ def write_json(path: Path | None, content: dict[str, Any], *, overwrite: bool = 
 
 
 def write_file(path: Path | None, write: Callable[[Path], object], *, overwrite: bool = False) -> None:
-    """Write to ``path``, if a path is given. Raises ``ClickException`` if the file cannot be written."""
+    """Write to ``path``, if a path is given. Raises ``ServiceError`` if the file cannot be written."""
     if path is not None:
-        with user_errors(), written(path, overwrite=overwrite) as partial:
+        with written(path, overwrite=overwrite) as partial:
             write(partial)
 
 

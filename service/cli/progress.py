@@ -13,6 +13,7 @@ import unicodedata
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import UTC, datetime
 
 import click
 
@@ -67,6 +68,11 @@ def duration(seconds: float) -> str:
     return f"{seconds:.0f} s"
 
 
+def moment(seconds: float, form: str = "%Y-%m-%d %H:%M:%SZ") -> str:
+    """A time as text, in UTC."""
+    return datetime.fromtimestamp(seconds, UTC).strftime(form)
+
+
 def step_text(stage: str, step: int, steps: int) -> str:
     """The stage and its step as text. If the number of steps is unknown, the text contains only the stage.
 
@@ -101,29 +107,24 @@ class _Teller:
                 filled = round(20 * step / max(steps, 1))
                 drawn = "#" * filled + "-" * (20 - filled)
                 elapsed_s = now_s - self.started_s
-                sys.stderr.write(
-                    f"\r{printable(stage):<32.32} [{drawn}] {step}/{steps}  {elapsed_s:5.1f} s{left:<14}"
-                )
-                sys.stderr.flush()
+                bar = f"\r{printable(stage):<32.32} [{drawn}] {step}/{steps}  {elapsed_s:5.1f} s{left:<14}"
+                click.echo(bar, err=True, nl=False)
                 self.open_line = True
             elif now_s - self.told_s >= LINE_EVERY_S:
                 self.told_s = now_s
                 elapsed = duration(now_s - self.started_s)
-                told = printable(step_text(stage, step, steps))
-                sys.stderr.write(f"{told} after {elapsed}{left}\n")
-                sys.stderr.flush()
+                echo(f"{step_text(stage, step, steps)} after {elapsed}{left}", err=True)
 
     def line(self, text: str) -> None:
         """Write a text on a separate line."""
         with self.lock:
             self.end()
-            sys.stderr.write(f"{printable(text)}\n")
-            sys.stderr.flush()
+            echo(text, err=True)
 
     def end(self) -> None:
         """End the line of the bar."""
         if self.open_line:
-            sys.stderr.write("\n")
+            echo("", err=True)
             self.open_line = False
 
 

@@ -19,12 +19,11 @@ from service.cli.options import (
     DATA,
     FILE,
     OUTPUT_FOLDER,
+    Text,
     check_fresh_folder,
-    progress_bar,
     read_settings,
-    user_errors,
 )
-from service.cli.progress import echo
+from service.cli.progress import echo, progress_bar
 from service.client.errors import WaitInterrupted
 from service.client.operations import Progress, without_none
 from service.client.outputs import check_outputs
@@ -93,7 +92,11 @@ def browser_address(url: str) -> str:
 
 @click.command()
 @click.option("--processes", type=click.IntRange(1), help="Number of worker processes [default: 1]")
-@click.option("--queues", help=f"Queues to serve, separated by commas: {', '.join(Queue)} [default: all]")
+@click.option(
+    "--queues",
+    type=Text(queues_named, keep=True),
+    help=f"Queues to serve, separated by commas: {', '.join(Queue)} [default: all]",
+)
 @click.option("--until-idle", type=click.FloatRange(0, min_open=True), is_flag=False, flag_value=IDLE_S, metavar="[SECONDS]",
               help=f"End with status 0 when this worker has run no job, and no job of its queues has waited, for SECONDS [without SECONDS: {IDLE_S:g}]")  # fmt: skip
 @DATA
@@ -115,11 +118,6 @@ def worker(
 
     # Celery imports the worker's module, which reads its settings from the environment.
     options = without_none({"worker_processes": processes, "worker_queues": queues})
-    if queues is not None:
-        try:
-            queues_named(queues)
-        except ValueError as error:
-            raise click.BadParameter(str(error), param_hint="--queues") from error
     settings = read_settings(data)
     os.environ |= environment(settings.model_copy(update=options))
     from workers.run.worker import main as run
@@ -138,7 +136,7 @@ def demo(image: Path | None, output: Path) -> None:
     A second demo replaces the files of the first one. The folder must be new, empty, or the folder of an earlier demo.
     """
     check_fresh_folder(output, overwrite=(output / DEMO_LOG).is_file())
-    with user_errors(), progress_bar() as report:
+    with progress_bar() as report:
         lines = run_demo(image, output, report)
     echo("\n".join(lines))
 

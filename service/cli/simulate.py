@@ -20,7 +20,6 @@ from service.cli.options import (
     counted,
     limits,
     listed,
-    user_errors,
     write_json,
     writes_files,
 )
@@ -111,18 +110,17 @@ def transit(
 
     given = [*scene_files, *(Path(one) for one in (diffraction, instrument) if one and Path(one).is_file())]
     check_fresh_folder(output, given, overwrite=overwrite)
-    with user_errors():
-        scatter = ScatterTruth(**{one.name: parameters.pop(one.name) for one in fields(ScatterTruth)})
-        plan = default_plan(**parameters)
-        edge = diffraction_size or min(2 * plan.size_px, LARGEST_DIFFRACTION_PX)
-        known = diffraction_kernel(instrument, diffraction, edge, limits(), threads=THREADS)
-        scenes = scenes_from_files(scene_files, plan, limits())
-        of_instrument = imitated(load_instrument(instrument))
-        made = simulated(plan, scatter, known, seed, scenes=scenes, imitated=of_instrument, threads=THREADS)
-        try:
-            write(made, output)
-        except OSError as error:
-            raise click.ClickException(f"cannot write {output}: {error.strerror or error}") from error
+    scatter = ScatterTruth(**{one.name: parameters.pop(one.name) for one in fields(ScatterTruth)})
+    plan = default_plan(**parameters)
+    edge = diffraction_size or min(2 * plan.size_px, LARGEST_DIFFRACTION_PX)
+    known = diffraction_kernel(instrument, diffraction, edge, limits(), threads=THREADS)
+    scenes = scenes_from_files(scene_files, plan, limits())
+    of_instrument = imitated(load_instrument(instrument))
+    made = simulated(plan, scatter, known, seed, scenes=scenes, imitated=of_instrument, threads=THREADS)
+    try:
+        write(made, output)
+    except OSError as error:
+        raise click.ClickException(f"cannot write {output}: {error.strerror or error}") from error
     exposures = sorted({shot.exposure_s for shot in plan.shots})
     echo(
         f"{output}: {counted(len(plan.shots), 'image')} of {plan.size_px} x {plan.size_px} px, {counted(len(plan.pointings), 'pointing')}, "
@@ -142,8 +140,7 @@ def bound(folder: Path, json_file: Path | None, overwrite: bool) -> None:
     from psfcore.simulate.bound import bound_of_sky
     from psfcore.simulate.transit import read_sky
 
-    with user_errors():
-        found = bound_of_sky(read_sky(folder, threads=THREADS), threads=THREADS)
+    found = bound_of_sky(read_sky(folder, threads=THREADS), threads=THREADS)
     write_json(json_file, found.to_json(), overwrite=overwrite)
     echo("\n".join(_lines(found)))
 

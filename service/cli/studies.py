@@ -21,18 +21,27 @@ from service.cli.options import (
     NOISE,
     PLOT,
     SATURATION,
+    Text,
     limits,
-    progress_bar,
     psf_limits,
-    user_errors,
     write_file,
     write_json,
     writes_files,
 )
-from service.cli.progress import echo
+from service.cli.progress import echo, progress_bar
 
 INSTRUMENT = click.option("--instrument", default="hri_euv", metavar="NAME|FILE",
                           help="A known instrument, or an instrument file (TOML)")  # fmt: skip
+
+
+def _numbers(text: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(part) for part in text.split(","))
+    except ValueError as error:
+        raise ValueError(f"expected numbers separated by commas; got {text!r}") from error
+
+
+NUMBERS = Text(_numbers)
 ARM_NUMBERS = (
     "angles_deg", "angles_sigma_deg", "spacing_px", "spacing_sigma_px", "centre_xy", "reduced_chi2",
 )  # fmt: skip
@@ -44,6 +53,7 @@ ARM_NUMBERS = (
 @PLOT
 @click.option(
     "--distances",
+    type=NUMBERS,
     help="Distances from filter wheel to detector, mm, such as 50,273,550 [default: the seven distances of the paper]",
 )
 @click.option("--phases", default=16, type=click.IntRange(1, 256),
@@ -55,7 +65,7 @@ def fresnel(
     instrument: str,
     json_file: Path | None,
     plot: Path | None,
-    distances: str | None,
+    distances: tuple[float, ...] | None,
     phases: int,
     windows: int | None,
     overwrite: bool,
@@ -65,10 +75,10 @@ def fresnel(
     from psfcore.diffraction.plots import fresnel_png
     from psfcore.instruments.model import load_instrument
 
-    with user_errors(), progress_bar() as report:
+    with progress_bar() as report:
         study = fresnel_study(
             load_instrument(instrument),
-            distances_mm=DISTANCES_MM if distances is None else _numbers("--distances", distances),
+            distances_mm=DISTANCES_MM if distances is None else distances,
             phases=phases,
             windows=windows,
             progress=lambda done, of: report("distances", done, of),
@@ -115,17 +125,16 @@ def arms(
     from psfcore.flare.arms import measure_arms
     from psfcore.flare.plots import arms_png
 
-    with user_errors():
-        flare = read_observation(image, limits(), saturation_dn=saturation_dn)
-        reference = None
-        if background is not None:
-            before = read_observation(background, limits(), saturation_dn=saturation_dn)
-            reference = np.where(before.valid, before.pixels, np.nan)
-        measured = measure_arms(
-            flare.pixels, centre_xy, reference=reference, saturated=~flare.valid, n_arms=n_arms
-        )
-        draw = partial(arms_png, flare.pixels, measured, unit=unit_label(flare))
-        write_file(plot, draw, overwrite=overwrite)
+    flare = read_observation(image, limits(), saturation_dn=saturation_dn)
+    reference = None
+    if background is not None:
+        before = read_observation(background, limits(), saturation_dn=saturation_dn)
+        reference = np.where(before.valid, before.pixels, np.nan)
+    measured = measure_arms(
+        flare.pixels, centre_xy, reference=reference, saturated=~flare.valid, n_arms=n_arms
+    )
+    draw = partial(arms_png, flare.pixels, measured, unit=unit_label(flare))
+    write_file(plot, draw, overwrite=overwrite)
     for angle, sigma in zip(measured.angles_deg, measured.angles_sigma_deg, strict=True):
         echo(f"arm at {angle:8.3f} ± {sigma:.3f} degrees from +x towards +y")
     echo(f"spacing  {measured.spacing_px:8.4f} ± {measured.spacing_sigma_px:.4f} px")
@@ -139,24 +148,28 @@ def arms(
 
 @click.command()
 @INSTRUMENT
-@click.option("--pitches", default="400,635,800,1000,1270,1600,2000", help="Mesh pitches to try, um")
-@click.option("--wires", default="20,30,40,60", help="Wire widths to try, um")
+@click.option(
+    "--pitches", type=NUMBERS, default="400,635,800,1000,1270,1600,2000", help="Mesh pitches to try, um"
+)
+@click.option("--wires", type=NUMBERS, default="20,30,40,60", help="Wire widths to try, um")
 @JSON
 @PLOT
 @writes_files
 def design(
-    instrument: str, pitches: str, wires: str, json_file: Path | None, plot: Path | None, overwrite: bool
+    instrument: str,
+    pitches: tuple[float, ...],
+    wires: tuple[float, ...],
+    json_file: Path | None,
+    plot: Path | None,
+    overwrite: bool,
 ) -> None:
     """Tabulate the diffracted light for combinations of pitch and wire width of the entrance mesh."""
     from psfcore.diffraction.design_study import design_study
     from psfcore.diffraction.plots import design_png
     from psfcore.instruments.model import load_instrument
 
-    with user_errors():
-        study = design_study(
-            load_instrument(instrument), _numbers("--pitches", pitches), _numbers("--wires", wires)
-        )
-        write_file(plot, partial(design_png, study), overwrite=overwrite)
+    study = design_study(load_instrument(instrument), pitches, wires)
+    write_file(plot, partial(design_png, study), overwrite=overwrite)
     names = [field.name for field in dataclasses.fields(study.rows[0])]
     echo("  ".join(names))
     for row in study.rows:
@@ -164,15 +177,6 @@ def design(
         texts = (f"{value:.4g}" if isinstance(value, float) else str(value) for value in values)
         echo("  ".join(f"{text:>{len(name)}}" for text, name in zip(texts, names, strict=True)))
     write_json(json_file, dataclasses.asdict(study), overwrite=overwrite)
-
-
-def _numbers(option: str, text: str) -> tuple[float, ...]:
-    try:
-        return tuple(float(part) for part in text.split(","))
-    except ValueError as error:
-        raise click.BadParameter(
-            f"expected numbers separated by commas; got {text!r}", param_hint=option
-        ) from error
 
 
 # --- a flare --------------------------------------------------------------------------------------------
@@ -223,18 +227,17 @@ def flare(
     from psfcore.flare.plots import flare_png
     from psfcore.noise import Noise
 
-    with user_errors():
-        with psf_file(psf) as file:
-            tested = read_psf(file, psf_limits())
-        found = judge_on_flare(
-            read_observation(image, limits(), saturation_dn=saturation_dn),
-            read_observation(background, limits(), saturation_dn=saturation_dn),
-            tested,
-            **along,
-            noise=None if noise is None else Noise(*noise),
-        )
-        draw = partial(flare_png, found.difference, found.usable, found.comparison, unit=found.unit)
-        write_file(plot, draw, overwrite=overwrite)
+    with psf_file(psf) as file:
+        tested = read_psf(file, psf_limits())
+    found = judge_on_flare(
+        read_observation(image, limits(), saturation_dn=saturation_dn),
+        read_observation(background, limits(), saturation_dn=saturation_dn),
+        tested,
+        **along,
+        noise=None if noise is None else Noise(*noise),
+    )
+    draw = partial(flare_png, found.difference, found.usable, found.comparison, unit=found.unit)
+    write_file(plot, draw, overwrite=overwrite)
     echo("\n".join(summary_lines(found.comparison)))
     if json_file is not None:
         inputs = {

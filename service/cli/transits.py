@@ -29,14 +29,12 @@ from service.cli.options import (
     is_local,
     limits,
     options_of,
-    progress_bar,
-    user_errors,
     write_file,
     write_json,
     writes_files,
 )
 from service.cli.progress import Report as Progress
-from service.cli.progress import echo
+from service.cli.progress import echo, progress_bar, say
 from service.client.operations import Operations
 from workers.contract.requests import GapDiagnose, Report
 
@@ -62,12 +60,11 @@ def _reporting(
     json_file: None: the file is temporary. gap_effects: as in `connection`.
     """
     with (
-        user_errors(),
         TemporaryDirectory(prefix="heliopsf-") as folder,
         connection(gap_effects=gap_effects) as service,
-        progress_bar() as say,
+        progress_bar() as show,
     ):
-        yield service, json_file or Path(folder) / "report.json", say
+        yield service, json_file or Path(folder) / "report.json", show
 
 
 @click.command()
@@ -100,13 +97,13 @@ def report(
         raise click.UsageError(
             "--shapes fits every shape to TRANSIT, so it cannot be used with --psf: remove one of the two"
         )
-    with _reporting(json_file) as (service, numbers, say):
+    with _reporting(json_file) as (service, numbers, show):
         found = service.report(
             transit,
             numbers,
             page=output,
             preview=plot,
-            progress=say,
+            progress=show,
             psf_id=named_psf(service, psf),
             **parameters,
         )
@@ -185,13 +182,13 @@ def diagnose(
         raise click.UsageError(
             "--effects: expected --local with it; a service tests the effects in HELIOPSF_GAP_EFFECTS"
         )
-    with _reporting(json_file, gap_effects=effects or "") as (service, numbers, say):
+    with _reporting(json_file, gap_effects=effects or "") as (service, numbers, show):
         found = service.diagnose_gap(
             transit,
             numbers,
             page=output,
             preview=plot,
-            progress=say,
+            progress=show,
             psf_id=named_psf(service, psf),
             # A service always makes the corrected PSF and keeps it, so that later requests find it.
             correct=corrected_file is not None or not is_local(),
@@ -285,13 +282,10 @@ def blind(
     from psfcore.blind.score import write_score
     from psfcore.simulate.inputs import image_rate
 
-    def say(line: str) -> None:
-        echo(line, err=True)
-
     plan = SetPlan(**parameters)
     if plan.clean_only and plan.only:
         raise click.UsageError("expected one of --clean-only and --only; got both")
-    with user_errors(), alone_in(output):
+    with alone_in(output):
         planes = [image_rate(file, limits()) for file in scenes]
         blind_set, not_made = make_set(output, plan, scenes=planes, processes=processes, progress=say)
         numbers = [number for number in range(plan.cases) if number not in not_made]
@@ -339,17 +333,16 @@ def plan(
     from psfcore.gap.planning import limits_of_file
     from psfcore.gap.report.limits import lines, plan_page
 
-    with user_errors():
-        with progress_bar() as say:
-            found = limits_of_file(
-                plan_file,
-                limits(),
-                instrument=instrument,
-                diffraction=diffraction,
-                seed=seed,
-                threads=THREADS,
-                progress=say,
-            )
-        write_json(json_file, found.as_json(), overwrite=overwrite)
-        write_file(output, lambda file: file.write_text(plan_page(found), "utf-8"), overwrite=overwrite)
+    with progress_bar() as show:
+        found = limits_of_file(
+            plan_file,
+            limits(),
+            instrument=instrument,
+            diffraction=diffraction,
+            seed=seed,
+            threads=THREADS,
+            progress=show,
+        )
+    write_json(json_file, found.as_json(), overwrite=overwrite)
+    write_file(output, lambda file: file.write_text(plan_page(found), "utf-8"), overwrite=overwrite)
     echo("\n".join(lines(found)))

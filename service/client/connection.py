@@ -16,6 +16,7 @@ from typing import Any, Self
 
 import httpx
 
+from psfcore.files import sha256_of
 from service.client.errors import (
     DEFAULT_SERVER,
     FIRST_WAIT_S,
@@ -349,41 +350,33 @@ def upload_in_parts(ask: Ask, path: Path, kind: str, filename: str, say: Callabl
     ask(method, address, ...): sends a request. Raises ``ServiceError`` if the service refuses the file, or if it does not
     answer for 10 minutes.
     """
-    with path.open("rb") as file:
-        sha256 = hashlib.file_digest(file, "sha256").hexdigest()
     length = path.stat().st_size
-    metadata = {"kind": kind, "filename": filename, "sha256": sha256}
+    metadata = {"kind": kind, "filename": filename, "sha256": sha256_of(path)}
     text = ",".join(f"{key} {base64.b64encode(value.encode()).decode()}" for key, value in metadata.items())
     headers = TUS | {"Upload-Length": str(length), "Upload-Metadata": text}
     patience = Patience(say, "Trying to continue the upload")
-    while True:
-        passing = PASSING
-        try:
-            begun = ask("POST", "/v1/uploads", headers=headers)
-            if "content-location" in begun.headers:
-                return str(begun.headers["content-location"])
-            offset = int(begun.headers["upload-offset"])
-            patience.answered(f"the upload continues at {offset / length:.0%}")
-            passing = AGAIN
-            return _send_parts(ask, path, begun.headers["location"], offset, patience)
-        except ServiceError as error:
-            patience.wait(error, passing)
-
-
-def _send_parts(ask: Ask, path: Path, address: str, offset: int, patience: Patience) -> str:
-    """Send all parts from an offset on; returns the address of the file."""
     with path.open("rb") as file:
-        file.seek(offset)
         while True:
-            part = file.read(PART_BYTES)
-            checksum = base64.b64encode(hashlib.sha256(part).digest()).decode()
-            headers = TUS | {
-                "Content-Type": "application/offset+octet-stream",
-                "Upload-Offset": str(offset),
-                "Upload-Checksum": f"sha256 {checksum}",
-            }
-            answer = ask("PATCH", address, content=part, headers=headers)
-            if "content-location" in answer.headers:
+            passing = PASSING
+            try:
+                answer = ask("POST", "/v1/uploads", headers=headers)
+                while "content-location" not in answer.headers:
+                    offset = int(answer.headers["upload-offset"])
+                    patience.answered(f"the upload continues at {offset / length:.0%}")
+                    passing = AGAIN
+                    file.seek(offset)
+                    answer = ask("PATCH", answer.headers["location"], **_part(file.read(PART_BYTES), offset))
                 return str(answer.headers["content-location"])
-            patience.answered()
-            offset += len(part)
+            except ServiceError as error:
+                patience.wait(error, passing)
+
+
+def _part(content: bytes, offset: int) -> dict[str, Any]:
+    """The body and the headers of a request that sends the bytes from an offset on."""
+    checksum = base64.b64encode(hashlib.sha256(content).digest()).decode()
+    headers = {
+        "Content-Type": "application/offset+octet-stream",
+        "Upload-Offset": str(offset),
+        "Upload-Checksum": f"sha256 {checksum}",
+    }
+    return {"content": content, "headers": TUS | headers}

@@ -7,7 +7,7 @@ import ipaddress
 import time
 from collections.abc import Callable, Collection, Mapping
 from typing import Any, TypeVar
-from urllib.parse import SplitResult, urlsplit
+from urllib.parse import urlsplit
 
 DEFAULT_SERVER = "http://127.0.0.1:8765"
 EXAMPLE = f"{DEFAULT_SERVER} or localhost:8765"
@@ -134,20 +134,23 @@ def service_address(text: str) -> str:
     key must not be sent without TLS by mistake. Raises ``ServiceError`` "bad-address".
     """
     text = text.strip()
-    if "://" in text:
-        parts = _split(text, text)
-        if parts.scheme not in ("http", "https"):
-            raise _bad(text)
-        return text
-    parts = _split(f"http://{text}", text)
-    assert parts.hostname is not None
-    if not is_loopback(parts.hostname):
+    url = text if "://" in text else f"http://{text}"
+    try:
+        parts = urlsplit(url)
+        valid = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
+    except ValueError:  # a port that is no number, or an IPv6 address without its brackets
+        valid = False
+    if not valid or any(sign.isspace() or not sign.isprintable() for sign in text):
+        raise ServiceError(
+            f"expected the address of a service, such as {EXAMPLE}; got {text!r}", code="bad-address"
+        )
+    if url != text and not is_loopback(parts.hostname or ""):
         raise ServiceError(
             f"expected http:// or https:// before the name of another machine; got {text!r}: "
             f"write https://{text} if the service uses TLS, else http://{text}",
             code="bad-address",
         )
-    return parts.geturl()
+    return url
 
 
 def how_to_start(server: str) -> str:
@@ -167,21 +170,3 @@ def is_loopback(host: str) -> bool:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:  # the host is a name, which may stand for another address on another machine
         return False
-
-
-def _split(url: str, text: str) -> SplitResult:
-    """The parts of a URL. Raises ``ServiceError`` if it has no host or no valid port."""
-    try:
-        parts = urlsplit(url)
-        valid = bool(parts.hostname) and (parts.port is None or parts.port > 0)
-    except ValueError as error:  # a port that is no number, or an IPv6 address without its brackets
-        raise _bad(text) from error
-    if not valid or any(sign.isspace() or not sign.isprintable() for sign in text):
-        raise _bad(text)
-    return parts
-
-
-def _bad(text: str) -> ServiceError:
-    return ServiceError(
-        f"expected the address of a service, such as {EXAMPLE}; got {text!r}", code="bad-address"
-    )

@@ -98,8 +98,14 @@ class Client(Connection, Operations):
         channel: str | None = None,
         kind: str | None = None,
     ) -> dict[str, Any]:
-        series = {"instrument": instrument, "channel": channel, "kind": kind}
-        return self._upload("/v1/psfs", Path(path), {"name": name, "version": version, **series})
+        described = {
+            "name": name,
+            "version": version,
+            "instrument": instrument,
+            "channel": channel,
+            "kind": kind,
+        }
+        return self._upload("/v1/psfs", Path(path), described)
 
     def image_id(self, path: str | Path, sha256: str) -> str:
         try:

@@ -11,16 +11,15 @@ recognised by their cards INPSHA and PRODID, whatever their names.
 
 from __future__ import annotations
 
-import hashlib
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 from psfcore.errors import DataError, HeaderError
-from psfcore.files import fits_in
+from psfcore.files import fits_in, sha256_of
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.cards import optional_text
 from psfcore.fits.header import all_hdus, read_first_image
@@ -75,7 +74,7 @@ def deconvolve_many(
     """
     check_output_folder(folder)
     Path(folder).mkdir(parents=True, exist_ok=True)
-    run = _Run(service, images, Path(folder), overwrite, parameters)
+    run = _Run(service, images, Path(folder), overwrite, parameters, _products_in(Path(folder)))
     progress(0, len(images))
     for number, outcome in enumerate(run.outcomes(), 1):
         yield outcome
@@ -105,10 +104,8 @@ class _Run:
     folder: Path
     overwrite: bool
     parameters: dict[str, Any]
-
-    def __post_init__(self) -> None:
-        self._products = _products_in(self.folder)
-        self._pending: deque[_Pending | Outcome] = deque()
+    _products: _Products
+    _pending: deque[_Pending | Outcome] = field(default_factory=deque)
 
     def outcomes(self) -> Iterator[Outcome]:
         """The outcome for each image. Raises the same errors as ``deconvolve_many``."""
@@ -149,8 +146,7 @@ class _Run:
         No job is submitted if the folder already contains the product, or if the job of an earlier image makes the
         same product.
         """
-        with image.open("rb") as file:
-            sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+        sha256 = sha256_of(image)
         image_id = _patiently(lambda: self.service.image_id(image, sha256))
         request = deconvolution(image_id, **self.parameters)
         product_id = _patiently(lambda: self.service.result_id("deconvolve", **request))

@@ -207,9 +207,8 @@ class Operations(ABC):
         check_outputs((output, preview, changes), inputs=(image,), overwrite=overwrite)
         image_id = self.upload_image(image)["id"]
         request = deconvolution(image_id, changes_picture=changes is not None, **parameters)
-        product = self.run("deconvolve", request, progress)
-        self._fetch(product, {"file": output, "preview": preview, "changes": changes}, overwrite)
-        return product
+        files = {"file": output, "preview": preview, "changes": changes}
+        return self._download_result("deconvolve", request, files, progress, overwrite)
 
     def build_psf(
         self,
@@ -260,9 +259,8 @@ class Operations(ABC):
         request: dict[str, Any] = {"size": size, "component": component, **named}
         if mask is not None:
             request["mask_id"] = self.upload_image(mask)["id"]
-        psf = self.run("psf-build", request, progress)
-        self._fetch(psf, {"file": output, "preview": preview}, overwrite)
-        return psf
+        files = {"file": output, "preview": preview}
+        return self._download_result("psf-build", request, files, progress, overwrite)
 
     def psf_of_instrument(self, instrument: str) -> str:
         """Get the id of the PSF of an instrument, which is built if it does not exist.
@@ -461,8 +459,24 @@ class Operations(ABC):
         check_outputs(files.values(), inputs=(transit,), overwrite=overwrite)
         transit_id = self.upload_transit(transit)["id"]
         request = {"transit_id": transit_id, **without_none(parameters), **_noise(noise)}
+        return self._download_result(kind, request, files, progress, overwrite)
+
+    def _download_result(
+        self,
+        kind: str,
+        request: dict[str, Any],
+        files: dict[str, Name | None],
+        progress: Progress | None,
+        overwrite: bool,
+    ) -> dict[str, Any]:
+        """Run a job and download files of its result; returns the description of the result.
+
+        files: the file to write, by the name of the address in the description.
+        """
         result = self.run(kind, request, progress)
-        self._fetch(result, files, overwrite)
+        for name, path in files.items():
+            if path is not None:
+                self.download(result[name], path, overwrite=overwrite)
         return result
 
     def run(self, kind: str, parameters: dict[str, Any], progress: Progress | None) -> dict[str, Any]:
@@ -489,12 +503,6 @@ class Operations(ABC):
         """
         job = self.submit(kind, **parameters)
         return self.get(self.wait(job, progress=progress)["result"])
-
-    def _fetch(self, result: dict[str, Any], files: dict[str, Name | None], overwrite: bool) -> None:
-        """Download files of a result. files: the file to write, by the name of the address in the description."""
-        for name, path in files.items():
-            if path is not None:
-                self.download(result[name], path, overwrite=overwrite)
 
     @staticmethod
     def _ended(job: dict[str, Any]) -> dict[str, Any]:

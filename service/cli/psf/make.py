@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -18,13 +17,11 @@ from service.cli.options import (
     PLOT,
     is_local,
     options_of,
-    progress_bar,
     psf_limits,
-    user_errors,
+    write_file,
     writes_files,
 )
-from service.cli.progress import echo
-from service.client.outputs import written
+from service.cli.progress import echo, progress_bar
 from workers.contract.requests import CrossValidate, PsfBuild, PsfFit
 
 SHOWN_RADII_PX = (0.5, 1, 2, 5, 10, 11.5, 20, 50, 100, 200, 500, 1000)
@@ -51,15 +48,14 @@ def build(
 ) -> None:
     """Compute the PSF of an instrument."""
     with (
-        user_errors(),
-        _mask_of(instrument) as mask,
+        TemporaryDirectory(prefix="heliopsf-") as folder,
         connection() as service,
         progress_bar() as report,
     ):
         built = service.build_psf(
             instrument,
             output,
-            mask=mask,
+            mask=_mask_of(instrument, folder),
             preview=plot,
             progress=report,
             **parameters,
@@ -88,7 +84,7 @@ def fit(
     **parameters: Any,
 ) -> None:
     """Fit the scattered light in TRANSIT: a folder with a transit.json, or a .zip or .tar file of such a folder."""
-    with user_errors(), connection() as service, progress_bar() as say:
+    with connection() as service, progress_bar() as say:
         fitted = service.fit_psf(
             transit,
             output,
@@ -132,7 +128,7 @@ def crossval(
     **parameters: Any,
 ) -> None:
     """Estimate the uncertainty of the fit to TRANSIT: hold out blocks of images and bootstrap the other images, in many runs."""
-    with user_errors(), connection() as service, progress_bar() as report:
+    with connection() as service, progress_bar() as report:
         found = service.cross_validate(
             transit,
             json_file,
@@ -154,13 +150,11 @@ def show(file: Path, plot: Path | None, overwrite: bool) -> None:
     from psfcore.fits.psfs import read_psf
     from psfcore.psf import cumulative_curve
 
-    with user_errors():
-        psf = read_psf(file, psf_limits())
-        if plot is not None:
-            from psfcore.drawing.plots import psf_png
+    psf = read_psf(file, psf_limits())
+    if plot is not None:
+        from psfcore.drawing.plots import psf_png
 
-            with written(plot, overwrite=overwrite) as picture:
-                psf_png(psf, picture)
+        write_file(plot, partial(psf_png, psf), overwrite=overwrite)
     radii = np.array([r for r in SHOWN_RADII_PX if r < psf.reach_px])
     kernels = {"TOTAL": psf.kernel, **psf.components}
     curves = {name: cumulative_curve(kernel, radii) for name, kernel in kernels.items()}
@@ -175,12 +169,10 @@ def show(file: Path, plot: Path | None, overwrite: bool) -> None:
         echo(f"{radius:>8g}" + "".join(f"{curve[n]:>15.3f}" for curve in curves.values()))
 
 
-@contextmanager
-def _mask_of(instrument: str) -> Iterator[Path | None]:
-    """The mask image that the user's instrument file names, as a FITS file; None if it names no mask image."""
+def _mask_of(instrument: str, folder: str) -> Path | None:
+    """The mask image that the user's instrument file names, as a FITS file in this folder; None if it names no mask image."""
     if not instrument.endswith(".toml"):
-        yield None
-        return
+        return None
     from astropy.io import fits
 
     from psfcore.fits.images import read_mask_image
@@ -188,10 +180,7 @@ def _mask_of(instrument: str) -> Iterator[Path | None]:
 
     mount = load_instrument(instrument).mount
     if mount is None or mount.mask_image is None:
-        yield None
-        return
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "mask.fits"
-        mask = read_mask_image(Path(instrument).parent / mount.mask_image.file)
-        fits.PrimaryHDU(mask).writeto(path)
-        yield path
+        return None
+    file = Path(folder) / "mask.fits"
+    fits.PrimaryHDU(read_mask_image(Path(instrument).parent / mount.mask_image.file)).writeto(file)
+    return file

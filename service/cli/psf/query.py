@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,13 +21,11 @@ from service.cli.options import (
     FOLDER,
     JSON,
     OUTPUT,
-    progress_bar,
     psf_limits,
-    user_errors,
     write_json,
     writes_files,
 )
-from service.cli.progress import echo
+from service.cli.progress import echo, moment, progress_bar
 from service.client.outputs import written
 from workers.machine import psf_cache, published_folder
 
@@ -80,7 +78,7 @@ def get_psfs(names: tuple[str, ...], source: Path | None) -> None:
 
 def brought(name: str, source: Path | None) -> Path:
     """The file of a published PSF, which is brought first if it is not there; says where it is and how to cite it."""
-    with user_errors(), progress_bar() as report:
+    with progress_bar() as report:
         file = get(published_folder(), name, source=source, progress=report)
     one = published(name)
     echo(f"{file}: PSF {one.name}, {one.telescope} {one.channel}")
@@ -116,17 +114,17 @@ def query(
 ) -> None:
     """Show the light of a PSF beyond radii or in an annulus, and the difference from another PSF."""
     answers: dict[str, Any] = {}
-    with user_errors(), _asking(psf, compare) as ask:
+    with _asking(psf, compare) as ask:
         if radii or not (annulus or profile or compare):
-            reach_px = ask("encircled", radius=0.0)["reach_px"]
+            reach_px = ask["encircled"](radius=0.0)["reach_px"]
             shown = list(radii) or [r for r in SHOWN_RADII_PX if r <= reach_px]
-            answers["curve"] = ask("curve", radii=shown)
+            answers["curve"] = ask["curve"](radii=shown)
         if annulus is not None:
-            answers["annulus"] = ask("annulus", inner=annulus[0], outer=annulus[1])
+            answers["annulus"] = ask["annulus"](inner=annulus[0], outer=annulus[1])
         if profile:
-            answers["profile"] = ask("profile")
+            answers["profile"] = ask["profile"]()
         if compare is not None:
-            answers["compare"] = ask("compare")
+            answers["compare"] = ask["compare"]()
     for name, answer in answers.items():
         echo("\n".join(_LINES[name](answer)))
     write_json(json_file, answers, overwrite=overwrite)
@@ -144,12 +142,11 @@ def cutout(psf: str, size: int, output: Path, overwrite: bool) -> None:
     """Write the central part of a PSF, not renormalised. If the PSF is a file, the components are written too."""
     from psfcore.psf import central_part
 
-    with user_errors():
-        if is_psf_id(psf):
-            with remote() as service:
-                service.psf_cutout(psf, size, output, overwrite=overwrite)
-        else:
-            _write(output, central_part(_read(psf), size), overwrite)
+    if is_psf_id(psf):
+        with remote() as service:
+            service.psf_cutout(psf, size, output, overwrite=overwrite)
+    else:
+        _write(output, central_part(_read(psf), size), overwrite)
     echo(f"{output}: central {size} x {size} px")
 
 
@@ -163,7 +160,7 @@ def rebin(psf: str, factor: int, output: Path, overwrite: bool) -> None:
     """Write the PSF for images that are binned by FACTOR x FACTOR pixels."""
     from psfcore.psf_sampling import rebinned
 
-    with user_errors(), psf_file(psf) as file:
+    with psf_file(psf) as file:
         binned = rebinned(_read(str(file)), factor)
         _write(output, binned, overwrite)
     ny, nx = binned.kernel.shape
@@ -182,13 +179,12 @@ def cache() -> None:
 @cache.command("list", short_help="List the PSFs that are kept.")
 def list_cached() -> None:
     """List the PSFs that are kept, the last used first: id, size, last use, instrument."""
-    with user_errors():
-        folder = psf_cache()
-        psfs = folder.psfs()
-        for psf in psfs:
-            used = datetime.fromtimestamp(psf.used_at, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
-            name = _named(folder.provenance(psf.identity))
-            echo(f"{short(psf.identity)}  {psf.bytes / _MIB:8.1f} MiB  {used}  {name}")
+    folder = psf_cache()
+    psfs = folder.psfs()
+    for psf in psfs:
+        used = moment(psf.used_at, "%Y-%m-%dT%H:%M:%SZ")
+        name = _named(folder.provenance(psf.identity))
+        echo(f"{short(psf.identity)}  {psf.bytes / _MIB:8.1f} MiB  {used}  {name}")
     total = sum(psf.bytes for psf in psfs) / _MIB
     echo(f"{len(psfs)} PSFs, {total:.1f} of {folder.max_bytes // _MIB} MiB, in {folder.folder}")
 
@@ -196,9 +192,8 @@ def list_cached() -> None:
 @cache.command("clear", short_help="Remove all PSFs that are kept.")
 def clear() -> None:
     """Remove all PSFs that are kept. A PSF is built again when it is needed."""
-    with user_errors():
-        folder = psf_cache()
-        count, removed = len(folder.psfs()), folder.clear()
+    folder = psf_cache()
+    count, removed = len(folder.psfs()), folder.clear()
     echo(f"removed {count} PSFs, {removed / _MIB:.1f} MiB, from {folder.folder}")
 
 
@@ -212,8 +207,8 @@ def _named(provenance: dict[str, Any]) -> str:
 
 
 @contextmanager
-def _asking(psf: str, other: str | None) -> Iterator[Callable[..., dict[str, Any]]]:
-    """A function that answers questions about a PSF, and compares it with another one: the service answers for ids; for
+def _asking(psf: str, other: str | None) -> Iterator[dict[str, Callable[..., dict[str, Any]]]]:
+    """The functions that answer questions about a PSF, and compare it with another one: the service answers for ids; for
     files the tables are computed here."""
     psfs = [psf] if other is None else [psf, other]
     if len({is_psf_id(one) for one in psfs}) > 1:
@@ -224,23 +219,18 @@ def _asking(psf: str, other: str | None) -> Iterator[Callable[..., dict[str, Any
         from psfcore.tables.make import tables_of
 
         tables = [tables_of(_read(file)) for file in psfs]
-
-        def ask_files(question: str, **query: Any) -> dict[str, Any]:
-            if question == "compare":
-                return lookup.compare(*tables)
-            return lookup.QUESTIONS[question](tables[0], **query)
-
-        yield ask_files
+        of_first = {name: partial(question, tables[0]) for name, question in lookup.QUESTIONS.items()}
+        yield of_first | {"compare": partial(lookup.compare, *tables)}
         return
     with remote() as service:
         ids = [whole_id(service, "psfs", one) for one in psfs]
-
-        def ask_service(question: str, **query: Any) -> dict[str, Any]:
-            if question == "compare":
-                return service.compare_psfs(*ids)
-            return service.answer(ids[:1], question, query)
-
-        yield ask_service
+        yield {
+            "curve": partial(service.psf_curve, ids[0]),
+            "profile": partial(service.psf_profile, ids[0]),
+            "encircled": partial(service.psf_encircled, ids[0]),
+            "annulus": partial(service.psf_annulus, ids[0]),
+            "compare": partial(service.compare_psfs, *ids),
+        }
 
 
 def _read(file: str) -> Psf:

@@ -4,9 +4,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
@@ -26,12 +26,12 @@ from service.cli.options import (
     OUTPUT,
     OUTPUT_PLACE,
     PLOT,
+    Command,
     Place,
-    progress_bar,
     write_json,
     writes_files,
 )
-from service.cli.progress import echo
+from service.cli.progress import echo, progress_bar
 from service.cli.psf.make import say_fit
 from service.client.operations import without_none
 from workers.versions import TOTAL, PsfStatus
@@ -39,7 +39,6 @@ from workers.versions import TOTAL, PsfStatus
 if TYPE_CHECKING:
     from service.client.http import Client
 
-Command = TypeVar("Command", bound=Callable[..., Any])
 PSF_ID = id_argument("psf_id")
 REASON = click.option("--reason", default="", show_default=False, help="Reason, kept in the history")
 PRODUCT = click.option(

@@ -17,7 +17,7 @@ from psfcore.fits.header import seen_by
 from psfcore.instruments.unknown import unknown_instrument
 from service.cli import options as cli_options
 from service.cli import progress
-from service.cli.main import main
+from service.cli.main import NO_KEY, main, user_errors
 from service.cli.progress import Pace, progress_bar, say
 from service.client.http import ServiceError
 from tests.conftest import write_image, write_psf
@@ -49,12 +49,12 @@ def test_an_error_of_the_user_is_a_line_and_an_error_of_ours_keeps_its_traceback
         (ServiceError("refused"), "refused"),
         (OSError("disk full"), "disk full"),
         (TimeoutError("late"), "late"),
-        (no_key, cli_options.NO_KEY),
+        (no_key, NO_KEY),
     ):
-        with pytest.raises(click.ClickException) as caught, cli_options.user_errors():
+        with pytest.raises(click.ClickException) as caught, user_errors():
             raise error
         assert caught.value.message == told
-    with pytest.raises(ZeroDivisionError), cli_options.user_errors():
+    with pytest.raises(ZeroDivisionError), user_errors():
         raise ZeroDivisionError
 
 
@@ -65,7 +65,7 @@ def test_json_is_written_where_a_path_is_given_and_holds_no_nan(tmp_path: Path) 
     with pytest.raises(ValueError, match="JSON"):
         cli_options.write_json(tmp_path / "y.json", {"x": float("nan")})
     assert not (tmp_path / "y.json").exists()
-    with pytest.raises(click.ClickException, match="cannot write"):
+    with pytest.raises(ServiceError, match="cannot write"):
         cli_options.write_json(tmp_path, {"x": 1})
 
 
@@ -79,7 +79,7 @@ def test_an_image_without_a_known_psf_prints_the_ways_on(tmp_path: Path, image_f
     assert "--psf FILE.toml" in lines[2] and "psf fit TRANSIT" in lines[3] and "--local" in lines[3]
     psf = {"id": "a" * 64, "name": "p", "version": "1", "status": "draft", "same": ["plate_scale"]}
     error = unknown_instrument(seen_by(fits.Header({"INSTRUME": "TRACE"})), [psf])
-    with pytest.raises(click.ClickException) as caught, cli_options.user_errors():
+    with pytest.raises(click.ClickException) as caught, user_errors():
         raise ServiceError(str(error), code=error.code, fields=error.fields)
     lines = caught.value.message.splitlines()
     assert len(lines) == 4 and lines[0].endswith(error.fields["reason"])
