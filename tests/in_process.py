@@ -30,7 +30,7 @@ from workers.files.store import Store
 from workers.intake.compatibility import details_now
 from workers.intake.requests import resolve
 from workers.intake.uploads import image_row, transit_row, uploaded_psf_row
-from workers.rows import row_of
+from workers.lookup import row_of
 from workers.run.attempt import Attempt
 from workers.run.runner import Runner
 from workers.settings import Settings

@@ -186,24 +186,24 @@ class Watch:
     def ask(self, name: str, check: Callable[[], None]) -> Future[str]:
         """The result of a check, which may come later or never: "ok", or what is wrong."""
         with self._lock:
-            asked = self._running.get(name)
-            if asked is None or asked.done():
-                asked = self._running[name] = Future()
-                Thread(target=_answer, args=(asked, check), name=f"check of {name}", daemon=True).start()
-            return asked
+            answer = self._running.get(name)
+            if answer is None or answer.done():
+                answer = self._running[name] = Future()
+                Thread(target=_answer, args=(answer, check), name=f"check of {name}", daemon=True).start()
+            return answer
 
 
-def _answer(asked: Future[str], check: Callable[[], None]) -> None:
-    asked.set_running_or_notify_cancel()  # nobody can cancel it from now on
+def _answer(answer: Future[str], check: Callable[[], None]) -> None:
+    answer.set_running_or_notify_cancel()  # nobody can cancel it from now on
     try:
         check()
     except Unusable as fault:
-        asked.set_result(str(fault))
+        answer.set_result(str(fault))
     except BaseException as error:
-        asked.set_exception(error)
+        answer.set_exception(error)
         raise
     else:
-        asked.set_result(OK)
+        answer.set_result(OK)
 
 
 def needed(settings: Settings, catalogue: Catalogue, store: Store) -> dict[str, Callable[[], None]]:

@@ -19,7 +19,7 @@ from service.views import JobView, ProductView, RowView
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow
 from workers.contract.kinds import KINDS
 from workers.contract.requests import Identity, Rerun
-from workers.files.collection import files_of, remove_unnamed
+from workers.files.garbage import files_of, remove_unnamed
 from workers.intake.compatibility import details_now
 from workers.lineage import Ancestor, Format, lineage, provenance_text
 

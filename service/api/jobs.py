@@ -20,10 +20,10 @@ from workers.contract.jobs import Phase, Queue
 from workers.contract.kinds import KINDS, JobRequest, queue_of
 from workers.contract.requests import Deconvolve, ResolvedDeconvolve
 from workers.intake import estimates
-from workers.intake.again import reopened, there, without_results
 from workers.intake.psf_choice import ChosenPsf, reasoned_psf
+from workers.intake.repair import reopened, there, without_results
 from workers.intake.requests import resolve
-from workers.rows import no_such
+from workers.lookup import no_such
 
 log = logging.getLogger(__name__)
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"], responses=RESPONSES, route_class=KeyFirst)

@@ -15,7 +15,7 @@ from service.http.paging import Page, Paging, finite, identity, place
 from service.http.problems import RESPONSES, as_problems
 from service.http.state import Shared, State
 from service.views import PastChange, RowView, was_certified
-from workers.catalogue.affected import Affected, Place
+from workers.catalogue.affected import Affected, PageEnd
 from workers.catalogue.contexts import NAME
 from workers.catalogue.tables import PsfContextRow, PsfRow
 from workers.contract.psf_status import Pin, Reason, StatusChange
@@ -225,7 +225,7 @@ def list_affected(
 ) -> Page[AffectedView]:
     """Products whose PSF is deprecated, sorted by PSF; the products of each PSF are listed newest first."""
     at = place(paging.cursor, identity, finite, identity)
-    after = None if at is None else Place(*at)
+    after = None if at is None else PageEnd(*at)
     rows = state.catalogue.affected.page(
         caller.owner, superseded=superseded, limit=paging.limit + 1, after=after
     )

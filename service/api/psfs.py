@@ -23,7 +23,7 @@ from workers.catalogue.contexts import NOW
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import ImageRow, PsfRow
 from workers.contract.requests import Identity
-from workers.files.collection import remove_unnamed
+from workers.files.garbage import remove_unnamed
 from workers.intake.psf_choice import MOST_NAMED, SearchResult, look, look_for_image
 from workers.texts import Name
 from workers.versions import TIME, TOTAL, WORD, PsfStatus, iso, seconds

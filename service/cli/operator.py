@@ -23,13 +23,13 @@ from service.cli.psf.query import NAMES, SOURCE, brought
 from workers import checks
 from workers.catalogue.access import MEANINGS, OWNER, OWNER_RULE, Scope
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.owners import MIB, MOST_QUOTA_MIB, Usage
+from workers.catalogue.quotas import MIB, MOST_QUOTA_MIB, Usage
 from workers.catalogue.schema import SchemaError, SchemaStatus
 from workers.catalogue.tables import DEFAULT_OWNER, KeyRow
-from workers.files.collection import collect, examine
+from workers.files.garbage import collect, examine
 from workers.files.modes import keep_private, private_folder
 from workers.files.store import open_store
-from workers.intake.again import repair
+from workers.intake.repair import repair
 from workers.intake.uploads import uploaded_psf_row
 from workers.texts import check_line
 from workers.versions import TOTAL
@@ -204,7 +204,7 @@ def usage(data: Path | None) -> None:
     """Show how much each owner stores, and the quota of each owner."""
     settings = read_settings(data)
     with opened_catalogue(data) as catalogue:
-        for one in catalogue.owners.all(settings.quota_mib):
+        for one in catalogue.quotas.all(settings.quota_mib):
             echo(_line(one))
 
 
@@ -220,8 +220,8 @@ def quota(owner: str, mib: int | None, as_all: bool, data: Path | None) -> None:
     if not OWNER.fullmatch(owner):
         raise click.BadParameter(f"OWNER: expected {OWNER_RULE}; got {owner!r}")
     with opened_catalogue(data) as catalogue:
-        catalogue.owners.set_quota(owner, mib)
-        echo(_line(catalogue.owners.usage(owner, read_settings(data).quota_mib)))
+        catalogue.quotas.set_quota(owner, mib)
+        echo(_line(catalogue.quotas.usage(owner, read_settings(data).quota_mib)))
 
 
 @store.group("psf", short_help="Add published PSFs to a service.")

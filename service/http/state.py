@@ -24,7 +24,7 @@ from service.http.rates import AtOnce, Rates
 from workers.catalogue.catalogue import Catalogue, Row
 from workers.checks import Watch
 from workers.files.store import Store
-from workers.rows import row_of
+from workers.lookup import row_of
 from workers.settings import Settings
 
 if TYPE_CHECKING:

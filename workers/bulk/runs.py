@@ -25,7 +25,7 @@ from workers.contract.requests import Deconvolve, ResolvedDeconvolve
 from workers.files import archive as archive_files
 from workers.files.store import STORAGE_FULL
 from workers.intake.requests import resolved_deconvolution
-from workers.rows import no_such, row_of
+from workers.lookup import no_such, row_of
 from workers.settings import Settings
 
 KIND = "bulk"

@@ -24,7 +24,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from workers.catalogue.database import Database, Queries, is_away, newest_first
-from workers.catalogue.owners import lock_owner
+from workers.catalogue.quotas import lock_owner
 from workers.catalogue.tables import Base, KeyRow
 
 log = logging.getLogger(__name__)

@@ -28,7 +28,7 @@ class Affected:
 
 
 @dataclass(frozen=True)
-class Place:
+class PageEnd:
     """The last product of a page of the list. PSFs are sorted by id; the products of each PSF are sorted newest first."""
 
     psf_id: str
@@ -49,7 +49,9 @@ class AffectedProducts(Queries):
         with self._database.reading() as session:
             return _last_successor(_with_successors(session, [psf]), psf)
 
-    def page(self, owner: str, *, superseded: bool, limit: int, after: Place | None = None) -> list[Affected]:
+    def page(
+        self, owner: str, *, superseded: bool, limit: int, after: PageEnd | None = None
+    ) -> list[Affected]:
         """Products that were made with deprecated PSFs. superseded: only PSFs that have a successor.
 
         The method makes several queries, each of which reads only the rows that it returns. A single query with a join

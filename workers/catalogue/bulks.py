@@ -21,7 +21,7 @@ from psfcore.errors import DataError
 from workers.catalogue.bulk_progress import BATCH, BulkProgress
 from workers.catalogue.database import Database, Queries
 from workers.catalogue.jobs import Lease
-from workers.catalogue.owners import lock_owner
+from workers.catalogue.quotas import lock_owner
 from workers.catalogue.tables import BulkItemRow, BulkRow, JobRow
 from workers.contract.bulk import AT_WORK, DELETABLE, OPEN, STOPPED, BulkPhase, ItemState
 from workers.contract.jobs import Fault, JobError, Phase
@@ -36,7 +36,7 @@ LOST = JobError(
 
 
 @dataclass(frozen=True)
-class Listed:
+class BulkImage:
     """An image of a run, or the error if it cannot be used."""
 
     source: str
@@ -80,7 +80,7 @@ class Bulks(Queries):
                 return existing, False
             session.add(row)
             session.flush()
-            _add(session, row.id, 0, [Listed(one, True) for one in uploaded])
+            _add(session, row.id, 0, [BulkImage(one, True) for one in uploaded])
             return row, True
 
     def pause(self, bulk_id: str) -> bool:
@@ -201,7 +201,7 @@ class Bulks(Queries):
             return bulk
 
     def add_listed(
-        self, bulk_id: str, lease: Lease, images: Sequence[Listed], listed_to: Mapping[str, Any]
+        self, bulk_id: str, lease: Lease, images: Sequence[BulkImage], listed_to: Mapping[str, Any]
     ) -> bool:
         """Add images to a run. Returns False if another lease now lists the files, or if the run is not LISTING.
 
@@ -295,14 +295,14 @@ def _equal_open(row: BulkRow) -> Select[BulkRow]:
     return select(BulkRow).where(*same, BulkRow.phase.in_(sorted(OPEN)))
 
 
-def _add(session: Session, bulk_id: str, first: int, images: Sequence[Listed]) -> None:
+def _add(session: Session, bulk_id: str, first: int, images: Sequence[BulkImage]) -> None:
     """Insert images at position ``first`` and the positions after it, in batches."""
     for at in range(0, len(images), BATCH):
         batch = enumerate(images[at : at + BATCH], first + at)
         session.execute(insert(BulkItemRow), [_values(bulk_id, number, image) for number, image in batch])
 
 
-def _values(bulk_id: str, position: int, image: Listed) -> Mapping[str, Any]:
+def _values(bulk_id: str, position: int, image: BulkImage) -> Mapping[str, Any]:
     failed = image.error is not None
     return {
         "bulk_id": bulk_id,

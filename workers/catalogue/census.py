@@ -9,7 +9,7 @@ from sqlalchemy import ColumnElement, case, delete, func, literal, select
 
 from workers.catalogue.database import Queries, insert_into
 from workers.catalogue.jobs import no_equal_at_work
-from workers.catalogue.owners import FileRow
+from workers.catalogue.quotas import FileRow
 from workers.catalogue.tables import (
     ImageRow,
     JobRow,

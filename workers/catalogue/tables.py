@@ -75,7 +75,7 @@ def _change_time() -> MappedColumn[float]:
     return mapped_column(default=Now(), server_default="0", onupdate=later)
 
 
-class Owned:
+class OwnerColumns:
     """Columns of a thing of an owner."""
 
     owner: Mapped[str] = mapped_column(String(64), primary_key=True)
@@ -93,7 +93,7 @@ class Change:
     reason: Mapped[str] = mapped_column(String(400))
 
 
-class Uploaded(Owned):
+class UploadColumns(OwnerColumns):
     """Columns of an upload; its id is the SHA-256 of its bytes."""
 
     bytes: Mapped[int] = mapped_column(BigInteger)
@@ -101,21 +101,21 @@ class Uploaded(Owned):
     summary: Mapped[dict[str, Any]]
 
 
-class ImageRow(Uploaded, Base):
+class ImageRow(UploadColumns, Base):
     """An uploaded image."""
 
     __tablename__ = "images"
     __table_args__ = (_listed("images"), _summed("images"))
 
 
-class TransitRow(Uploaded, Base):
+class TransitRow(UploadColumns, Base):
     """An uploaded transit: the archive, unchanged."""
 
     __tablename__ = "transits"
     __table_args__ = (_listed("transits"), _summed("transits"))
 
 
-class PsfRow(Owned, Base):
+class PsfRow(OwnerColumns, Base):
     """An uploaded, built or fitted PSF. Its content never changes; a PSF with other content has another row.
 
     Before the PSF is certified, ``version`` is the version in the file. Afterwards it is the version in the series.
@@ -192,7 +192,7 @@ class PsfChangeRow(Change, Base):
     __table_args__ = (Index("psf_changes_of_a_psf", "owner", "psf_id", "number"),)
 
 
-class PsfContextRow(Owned, Base):
+class PsfContextRow(OwnerColumns, Base):
     """A context: a named set of PSFs, with one PSF for each series and range of times.
 
     A context never changes. Its id is the hash of its name and of its pins.
@@ -237,7 +237,7 @@ class DefaultContextRow(Change, Base):
     __table_args__ = (Index("default_contexts_of_an_owner", "owner", "number"),)
 
 
-class ProductRow(Owned, Base):
+class ProductRow(OwnerColumns, Base):
     """A deconvolved image; its id is the identity of its request."""
 
     __tablename__ = "products"
@@ -348,7 +348,7 @@ class BulkRow(Base):
     lister: Mapped[str | None] = mapped_column(
         String(32)
     )  # token of the lease of the worker that lists files
-    # how far the files are listed (``workers.bulk.listing.Place``); null: the listing has not begun, or it has no files
+    # how far the files are listed (``workers.bulk.listing.SearchPosition``); null: the listing has not begun, or it has no files
     listed_to: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
     total: Mapped[int] = mapped_column(default=0)
     done: Mapped[int] = mapped_column(default=0)
@@ -408,7 +408,7 @@ class OwnerTurnRow(Base):
     number: Mapped[int] = mapped_column(BigInteger)
 
 
-class ReportRow(Owned, Base):
+class ReportRow(OwnerColumns, Base):
     """A report about a transit or about a rerun; its id is the identity of the request."""
 
     __tablename__ = "reports"
@@ -428,7 +428,7 @@ class ReportRow(Owned, Base):
     )
 
 
-class SolutionRow(Owned, Base):
+class SolutionRow(OwnerColumns, Base):
     """The kept solution of a transit.
 
     The solution is removed when it is old or when its room is needed, because a job can make it again.

@@ -50,7 +50,7 @@ class Patience:
     pause_s: float
 
 
-# The calls of a worker must end long before ``collection.SETTLED_AFTER_S``: until then, a file that was moved aside can come back.
+# The calls of a worker must end long before ``garbage.SETTLED_AFTER_S``: until then, a file that was moved aside can come back.
 WORKER = Patience(silence_s=30.0, tries=3, pause_s=0.0)
 REQUEST = Patience(silence_s=10.0, tries=2, pause_s=5.0)
 

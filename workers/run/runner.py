@@ -21,7 +21,7 @@ from workers import logs, traces
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.database import is_away
 from workers.catalogue.jobs import Lease
-from workers.catalogue.owners import NOT_KEPT
+from workers.catalogue.quotas import NOT_KEPT
 from workers.catalogue.tables import JobRow, ProductRow, PsfRow, ReportRow
 from workers.contract.jobs import Fault, JobError, Phase, Queue
 from workers.contract.kinds import KINDS
@@ -200,7 +200,7 @@ class Runner:
         """
         if not KINDS[job.kind].needs_room:
             return
-        usage = self._catalogue.owners.limited(job.owner, self._settings.quota_mib)
+        usage = self._catalogue.quotas.limited(job.owner, self._settings.quota_mib)
         if usage is not None and usage.full and not self._is_there(job):
             raise DataError("quota-exceeded", usage.no_room(NOT_KEPT))
 

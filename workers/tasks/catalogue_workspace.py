@@ -13,18 +13,18 @@ from typing import TYPE_CHECKING, Any
 
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits
-from workers.catalogue.catalogue import Catalogue, Made, Row
+from workers.catalogue.catalogue import AnyResult, Catalogue, Row
 from workers.catalogue.jobs import Lease, Part
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, ReportRow, TransitRow
 from workers.contract.identities import interpolated_psf_identity
 from workers.contract.jobs import JobError
 from workers.contract.kinds import KINDS, ResultType
 from workers.contract.requests import PsfBuild, ResolvedDeconvolve, ResolvedOnTransit
-from workers.files.collection import intact
+from workers.files.garbage import intact
 from workers.files.store import Store
-from workers.intake.again import TABLES, there
 from workers.intake.compatibility import DEPRECATED_CODE, deprecated_warning, of_upload
-from workers.rows import row_of
+from workers.intake.repair import TABLES, there
+from workers.lookup import row_of
 from workers.settings import Settings
 from workers.stage_timer import StageTimer
 from workers.tasks.workspace import PARTS, Json, Progress, Result, Workspace
@@ -190,7 +190,7 @@ class CatalogueWorkspace(Workspace):
 
     # Results ------------------------------------------------------------------------------------------
 
-    def made(self, table: type[Made], identity: str) -> Made | None:
+    def made(self, table: type[AnyResult], identity: str) -> AnyResult | None:
         """The row of the result of an earlier job; None if there is none or if one of its files is lost."""
         row = self.catalogue.get(table, identity, self.owner)
         return row if row is not None and intact(self.store, row) else None

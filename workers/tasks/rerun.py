@@ -22,7 +22,7 @@ from workers.catalogue.tables import ProductRow, PsfRow
 from workers.contract.identities import rerun_identity
 from workers.contract.kinds import KINDS, ResultType
 from workers.contract.requests import ResolvedRerun
-from workers.lineage import Made, lineage
+from workers.lineage import Creation, lineage
 from workers.tasks.catalogue_workspace import CatalogueWorkspace, ResultRow
 from workers.tasks.results import report_result
 from workers.tasks.workspace import Result
@@ -143,7 +143,7 @@ def _save(
 
 def _made(workspace: CatalogueWorkspace, row: Thing) -> dict[str, Any]:
     made = lineage(workspace.catalogue, row).made
-    assert isinstance(made, Made)
+    assert isinstance(made, Creation)
     told: dict[str, Any] = json.loads(made.model_dump_json(exclude={"parameters"}))
     return told
 

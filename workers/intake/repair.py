@@ -23,7 +23,7 @@ from workers.contract.identities import request_identity
 from workers.contract.jobs import Phase, Queue
 from workers.contract.kinds import KINDS, ResultType
 from workers.contract.requests import PsfTables
-from workers.files.collection import Fault, intact
+from workers.files.garbage import Fault, intact
 from workers.files.store import Store
 from workers.lineage import made_by
 
@@ -76,7 +76,7 @@ def repair(fault: Fault, catalogue: Catalogue, store: Store) -> str:
             store.set_aside(digest)
     match row:
         case SolutionRow():
-            catalogue.owners.forget_solutions([row])
+            catalogue.quotas.forget_solutions([row])
             return "removed; the next job on the transit makes it again"
         case ImageRow() | TransitRow():
             return f"owner {row.owner} must upload the file again ({row.filename or 'without a name'})"

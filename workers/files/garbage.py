@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 from psfcore.errors import DataError
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.owners import KEPT, UPLOADED, WITH_FILES, FileRow
+from workers.catalogue.quotas import KEPT, UPLOADED, WITH_FILES, FileRow
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, ReportRow, SolutionRow, TransitRow
 from workers.files.store import Blob, FileState, Store, StoreAway
 from workers.settings import Settings
@@ -146,7 +146,7 @@ def collect(
     kept_before = time.time() - older_than_s
     there = {blob.digest: blob for blob in store.blobs()}
     left = dict(there)
-    solutions = catalogue.owners.solutions_before(kept_before)
+    solutions = catalogue.quotas.solutions_before(kept_before)
     for digest in catalogue.named_files.all(solutions_from=kept_before):
         left.pop(digest, None)
     if there and len(left) == len(there):
@@ -166,7 +166,7 @@ def collect(
             "all, add --even-most",
         )
     if not dry_run:
-        catalogue.owners.forget_solutions(solutions)
+        catalogue.quotas.forget_solutions(solutions)
         old = _removed(old, catalogue, store, kept_before, second_look_after_s)
     return Collected(len(there), sum(blob.bytes for blob in there.values()), tuple(old))
 
@@ -234,7 +234,7 @@ def retain(catalogue: Catalogue, store: Store, settings: Settings) -> dict[tuple
     deleted: dict[tuple[str, str], list[int]] = defaultdict(list)
     for (owner, kind), days in settings.kept_days.items():
         others = [other for other, of in settings.kept_days if other and of == kind]
-        for of, identity, size in catalogue.owners.old(kind, time.time() - days * DAY_S, owner, others):
+        for of, identity, size in catalogue.quotas.old(kind, time.time() - days * DAY_S, owner, others):
             if settings.keep_dry_run or _delete(catalogue, store, kind, of, identity):
                 deleted[of, kind].append(size)
     done = "would delete" if settings.keep_dry_run else "deleted"
