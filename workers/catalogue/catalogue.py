@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from sqlalchemy import Select, String, cast, create_engine, false, select, update
+from sqlalchemy import Select, String, cast, create_engine, false, select
 from sqlalchemy.exc import DatabaseError, IntegrityError
 from sqlalchemy.orm import Session
 from sqlalchemy.orm.attributes import flag_modified
@@ -97,13 +97,14 @@ class Catalogue:
         """Close all connections."""
         self._database.engine.dispose()
 
-    def ping(self) -> None:
-        """Raise ``sqlalchemy.exc.SQLAlchemyError`` if the database does not answer."""
-        self._database.clock()
+    def clock(self) -> float:
+        """The time of the database's clock, in seconds since 1970. Raises ``sqlalchemy.exc.SQLAlchemyError`` if the
+        database does not answer."""
+        return self._database.clock()
 
     def check_writable(self) -> None:
         """Raise ``sqlalchemy.exc.SQLAlchemyError`` if the database refuses changes. Changes nothing."""
-        self._database.change(update(WorkerRow).where(false()).values(version=""))
+        self._database.set(WorkerRow, [false()], version="")
 
     def check_pages(self) -> None:
         """Raise ``sqlalchemy.exc.DatabaseError`` if the file of an SQLite database is damaged.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from sqlalchemy import ColumnElement, case, delete, func, literal, select
+from sqlalchemy import case, delete, func, literal, select
 
 from workers.catalogue.database import Queries, insert_into
 from workers.catalogue.jobs import no_equal_at_work
@@ -120,11 +120,12 @@ class Census(Queries):
         """Number of executing jobs whose worker has been silent for longer than the lease."""
         now = self._database.now
         heard = JobRow.heartbeat_at.between(now - lease_s, now + lease_s)
-        return self._count_jobs(JobRow.phase == Phase.EXECUTING, ~heard)
+        return self._database.count(JobRow, JobRow.phase == Phase.EXECUTING, ~heard)
 
     def count_unsubmitted(self, older_than_s: float) -> int:
         """Number of queued jobs that could start, but were not given to the broker within ``older_than_s``."""
-        return self._count_jobs(
+        return self._database.count(
+            JobRow,
             JobRow.phase == Phase.QUEUED,
             JobRow.submitted_at.is_(None),
             JobRow.created_at < self._database.now - older_than_s,
@@ -134,18 +135,12 @@ class Census(Queries):
     def count_untaken(self, older_than_s: float) -> int:
         """Number of queued jobs that are older than ``older_than_s``, and that were given to the broker more than once
         since they were queued."""
-        return self._count_jobs(
+        return self._database.count(
+            JobRow,
             JobRow.phase == Phase.QUEUED,
             JobRow.submissions > 1,
             JobRow.created_at < self._database.now - older_than_s,
         )
-
-    def _count_jobs(self, *conditions: ColumnElement[bool]) -> int:
-        return self._database.first(select(func.count()).select_from(JobRow).where(*conditions)) or 0
-
-    def clock(self) -> float:
-        """The time of the database's clock, in seconds since 1970."""
-        return self._database.clock()
 
 
 class KeptStageTimes(Queries):

@@ -19,7 +19,7 @@ import shutil
 import stat
 import uuid
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePath
@@ -378,15 +378,11 @@ def _folder(folder: Path, allowed: Sequence[Path], *, make: bool) -> Iterator[in
 
 
 def _make(name: str, folder: int) -> None:
-    try:
+    with suppress(FileExistsError):
         os.mkdir(name, dir_fd=folder)
         open_made_folder(name, folder)
-    except FileExistsError:
-        return
 
 
 def _remove(name: str, folder: int) -> None:
-    try:
+    with suppress(FileNotFoundError):
         os.unlink(name, dir_fd=folder)
-    except FileNotFoundError:
-        return

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 from psfcore.errors import DataError
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.quotas import KEPT, UPLOADED, WITH_FILES, FileRow
+from workers.catalogue.quotas import KEPT, WITH_FILES, FileRow
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, ReportRow, SolutionRow, TransitRow
 from workers.files.store import Blob, FileState, Store, StoreAway
 from workers.settings import Settings
@@ -32,28 +32,26 @@ SECOND_LOOK_AFTER_S = 10.0
 # Other files may be new when they are moved aside. An upload adds its row directly after it has stored its file, a job
 # within a minute, and both may wait for other writers of the database.
 SETTLED_AFTER_S = 300.0
-# Entries of a row's details that name further files.
-NAMED_IN_DETAILS = (
-    "changes_picture_sha256",
-    "output_sha256",
-    "page_sha256",
-    "page_texts_sha256",
-    "report_sha256",
-    "tables_sha256",
-    "thumbnail_sha256",
-)
+# The entries of a row's details that name the further files of a result, by the names of the files.
+ENTRIES = {
+    "tables": "tables_sha256",
+    "report": "report_sha256",
+    "html": "page_sha256",
+    "texts": "page_texts_sha256",
+    "changes": "changes_picture_sha256",
+    "thumbnail": "thumbnail_sha256",
+}
 
 
-def files_of(row: ProductRow | PsfRow | ReportRow) -> Iterator[tuple[str, int | None]]:
-    """SHA-256 and size (bytes; None: not recorded) of each file of a result; its main file comes first."""
-    yield row.file_sha256, row.bytes
-    if row.preview_sha256 is not None:
-        yield row.preview_sha256, None
-    for name in NAMED_IN_DETAILS:
-        if row.details.get(name) is not None:
-            yield row.details[name], None
-    for digest in row.details.get("figures_sha256", ()):
-        yield digest, None
+def files_of(row: FileRow) -> list[tuple[str, int | None]]:
+    """SHA-256 and size (bytes; None: not recorded) of each file of a row; its main file comes first."""
+    if isinstance(row, ImageRow | TransitRow):
+        return [(row.id, row.bytes)]
+    if isinstance(row, SolutionRow):
+        return [(row.file_sha256, row.bytes)]
+    named = [row.details.get(entry) for entry in (*ENTRIES.values(), "output_sha256")]
+    further = [row.preview_sha256, *named, *row.details.get("figures_sha256", ())]
+    return [(row.file_sha256, row.bytes), *((digest, None) for digest in further if digest is not None)]
 
 
 def intact(store: Store, row: ProductRow | PsfRow | ReportRow) -> bool:
@@ -61,11 +59,8 @@ def intact(store: Store, row: ProductRow | PsfRow | ReportRow) -> bool:
 
     Raises ``StoreAway``.
     """
-    for digest, expected in files_of(row):
-        size = store.size(digest)
-        if size is None or expected not in (None, size):
-            return False
-    return True
+    sizes = ((store.size(digest), expected) for digest, expected in files_of(row))
+    return all(size is not None and expected in (None, size) for size, expected in sizes)
 
 
 @dataclass(frozen=True)
@@ -91,23 +86,13 @@ def examine(catalogue: Catalogue, store: Store, *, content: bool = True) -> Iter
     for table in WITH_FILES:
         for row in catalogue.named_files.kept(table):
             bad = []
-            for digest, size in _files(row):
+            for digest, size in files_of(row):
                 if digest not in states:
                     states[digest] = store.state(digest, size, content=content)
                 if states[digest] != "good":
                     bad.append((digest, states[digest]))
             if bad:
                 yield Fault(row, tuple(bad))
-
-
-def _files(row: FileRow) -> Iterator[tuple[str, int | None]]:
-    match row:
-        case ImageRow() | TransitRow():
-            yield row.id, row.bytes
-        case SolutionRow():
-            yield row.file_sha256, row.bytes
-        case _:
-            yield from files_of(row)
 
 
 @dataclass(frozen=True)
@@ -251,6 +236,5 @@ def _delete(catalogue: Catalogue, store: Store, kind: str, owner: str, identity:
         return catalogue.bulks.delete(identity)
     row = catalogue.delete(KEPT[kind], identity, owner)
     if row is not None:
-        named = [identity] if kind in UPLOADED else [digest for digest, _ in files_of(row)]
-        remove_unnamed(catalogue, store, named)
+        remove_unnamed(catalogue, store, [digest for digest, _ in files_of(row)])
     return row is not None

@@ -142,7 +142,7 @@ def _deconvolution(parameters: Mapping[str, Any], catalogue: Catalogue, owner: s
     whole_px = ny * nx
     if parameters.get("region") is not None:
         ny, nx = Box.parse(parameters["region"]).wider(EXPECTED_RIM_PX, (ny, nx)).shape
-    demand = Demand(
+    asked = Demand(
         method["name"],
         (ny, nx),
         (psf_shape[0], psf_shape[1]),
@@ -150,13 +150,13 @@ def _deconvolution(parameters: Mapping[str, Any], catalogue: Catalogue, owner: s
         margin_px=method["margin_px"],
         draws=draws,
     )
-    plane = math.prod(demand.plane)
+    plane = math.prod(asked.plane)
     interpolated = parameters.get("psf_interpolation") is not None
     fitted = interpolated or (psf is not None and "fit" in psf.details)
     runs = 1 + draws + (cost.psf_draws if draws and fitted else 0)
     cpu_s = built_s + cost.base_s + cost.image_ns * 1e-9 * ny * nx
     cpu_s += runs * method["steps"] * cost.of_method(method["name"]) * 1e-9 * plane
-    return cpu_s, max(built_mib, product_bytes(demand, whole_px) / MIB)
+    return cpu_s, max(built_mib, product_bytes(asked, whole_px) / MIB)
 
 
 def _build(

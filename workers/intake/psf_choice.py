@@ -252,12 +252,12 @@ def reasoned_psf(
         assert before is not None  # resolve() has found it
         name, version = interpolated_name(before.instrument, resolved.psf_id)
         why = _why_interpolated(resolved.psf_interpolation, catalogue, owner) + "; the job makes it first."
-        return ChosenPsf(id=resolved.psf_id, name=name, version=version, status=None, why=why)
-    # resolve() has found the image and the PSF, or the recipe of the PSF
-    assert resolved.psf_recipe is not None and resolved.psf_recipe.instrument is not None
-    instrument = load_instrument(resolved.psf_recipe.instrument)
-    name, version = instrument.name, instrument.version
-    why = _why_built(wanted, catalogue, owner) + "; the job builds it first."
+    else:
+        # resolve() has found the image and the PSF, or the recipe of the PSF
+        assert resolved.psf_recipe is not None and resolved.psf_recipe.instrument is not None
+        instrument = load_instrument(resolved.psf_recipe.instrument)
+        name, version = instrument.name, instrument.version
+        why = _why_built(wanted, catalogue, owner) + "; the job builds it first."
     return ChosenPsf(id=resolved.psf_id, name=name, version=version, status=None, why=why)
 
 

@@ -24,7 +24,13 @@ from workers.contract.identities import (
     psf_identity,
 )
 from workers.contract.kinds import KINDS, JobRequest, Kind, load
-from workers.contract.requests import Deconvolve, Parameters, PsfBuild, ResolvedDeconvolve
+from workers.contract.requests import (
+    Deconvolve,
+    Parameters,
+    PsfBuild,
+    ResolvedDeconvolve,
+    WithDiffraction,
+)
 from workers.intake import compatibility
 from workers.intake.compatibility import check_not_deprecated
 from workers.intake.psf_choice import SearchResult, no_psf, picked_for_image
@@ -85,7 +91,7 @@ def resolve_by_ids(submission: Submission) -> Parameters:
             if identity is not None and f"_{name}".endswith(f"_{of}_id"):
                 submission.row(table, identity)
     assert submission.kind.resolved is not None
-    if "diffraction_recipe" not in submission.kind.resolved.model_fields:
+    if not issubclass(submission.kind.resolved, WithDiffraction):
         return submission.resolved()
     summary = submission.row(TransitRow, parameters.transit_id).summary
     return submission.resolved(diffraction_recipe=_diffraction_of(submission, summary))

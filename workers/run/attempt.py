@@ -94,14 +94,10 @@ class Attempt:
                     self.stopped.set()
                     return
                 alive = self.catalogue.jobs.heartbeat(self.lease)
-            except SQLAlchemyError as error:
-                # Try again at the next heartbeat. If the database stays away, the lease expires and another worker gets the job.
-                log.warning("job %s: could not write the heartbeat: %s", self.lease.job_id, error)
-                continue
-            except MemoryError as error:
-                # The job has reached its memory limit. Its task gets the error. The next heartbeat may have memory
-                # again.
-                log.warning("job %s: no memory for the heartbeat: %s", self.lease.job_id, error)
+            except (SQLAlchemyError, MemoryError) as error:
+                # Try again at the next heartbeat. If the database stays away, the lease expires and another worker gets the
+                # job. MemoryError: the job has reached its memory limit, and its task gets the error too.
+                log.warning("job %s: could not write the heartbeat: %r", self.lease.job_id, error)
                 continue
             if not alive:
                 self.stopped.set()

@@ -4,13 +4,9 @@ exception into the error of a job."""
 from __future__ import annotations
 
 import logging
-import os
-import socket
 import time
-import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
 from importlib import import_module
 from typing import Any
 
@@ -22,12 +18,13 @@ from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.database import is_away
 from workers.catalogue.jobs import Lease
 from workers.catalogue.quotas import NOT_KEPT
-from workers.catalogue.tables import JobRow, ProductRow, PsfRow, ReportRow
+from workers.catalogue.tables import JobRow
 from workers.contract.jobs import Fault, JobError, Phase, Queue
 from workers.contract.kinds import KINDS
 from workers.files.store import NO_ROOM, STORAGE_FULL, Store, is_disk_full
+from workers.intake.repair import TABLES
 from workers.run.attempt import Assistance, Attempt, Cancelled, TookTooLong
-from workers.run.child import MARGIN, Child, Stopping, allowed_mib, is_out_of_memory
+from workers.run.child import MARGIN, Child, Stopping, allowed_mib, is_out_of_memory, worker_name
 from workers.settings import Settings
 from workers.stage_timer import StageTimer
 from workers.tasks.catalogue_workspace import CatalogueWorkspace
@@ -50,17 +47,6 @@ def load_tasks() -> None:
         kind.load_task()
     for name in LATE:
         import_module(name)
-
-
-def worker_name() -> str:
-    """The name of this process, as jobs and the list of workers show it."""
-    return _name(os.getpid())
-
-
-@cache
-def _name(process: int) -> str:
-    """A name that no other process has: workers in different containers may have the same host name and process id."""
-    return f"{socket.gethostname()}:{process}:{uuid.uuid4().hex[:8]}"
 
 
 class Runner:
@@ -198,20 +184,15 @@ class Runner:
         The quota was checked when the job was submitted, but other jobs may have filled it since then. A result that
         already exists needs no room.
         """
-        if not KINDS[job.kind].needs_room:
+        kind = KINDS[job.kind]
+        if not kind.needs_room:
             return
         usage = self._catalogue.quotas.limited(job.owner, self._settings.quota_mib)
-        if usage is not None and usage.full and not self._is_there(job):
+        if usage is None or not usage.full:
+            return
+        # An identical job, or an earlier attempt that could not record its end, may have made the result.
+        if not self._catalogue.ids_among(TABLES[kind.result], [job.work_key or ""], job.owner):
             raise DataError("quota-exceeded", usage.no_room(NOT_KEPT))
-
-    def _is_there(self, job: JobRow) -> bool:
-        """Whether the result already exists.
-
-        An identical job, or an earlier attempt that could not record its end, may have made it.
-        """
-        made, find = job.work_key, self._catalogue.get
-        tables: tuple[type[Any], ...] = (ProductRow, PsfRow, ReportRow)
-        return made is not None and any(find(table, made, job.owner) is not None for table in tables)
 
     def _keep_times(self, job: JobRow, times: StageTimer) -> None:
         """Add the stage times of an attempt to the sums. The outcome of the attempt is already recorded, so a failure here is only logged."""

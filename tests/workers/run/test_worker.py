@@ -51,7 +51,7 @@ def test_workers_of_one_host_name_and_process_id_have_different_names() -> None:
         "import os, socket\n"
         "os.getpid = lambda: 1\n"
         "socket.gethostname = lambda: 'worker'\n"
-        "from workers.run.runner import worker_name\n"
+        "from workers.run.child import worker_name\n"
         "print(worker_name() == worker_name(), worker_name())"
     )
     command = [sys.executable, "-c", code]
