@@ -13,7 +13,7 @@ import pytest
 from pydantic import TypeAdapter
 
 from psfcore.files import sha256_of
-from psfcore.fits.header import FitsLimits, read_summary
+from psfcore.fits.header import read_summary
 from psfcore.fits.psfs import stated_id
 from psfcore.fits.stored_psf import check_is_psf
 from psfcore.tables import lookup
@@ -61,7 +61,7 @@ class InProcess(Operations):
         self.catalogue = Catalogue(settings.catalogue_url)
         self.catalogue.upgrade()
         self._runner = Runner(settings, self.catalogue, self.store)
-        self._limits = FitsLimits(max_pixels=settings.max_pixels)
+        self._limits = settings.image_limits
 
     def close(self) -> None:
         self.catalogue.close()

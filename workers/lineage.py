@@ -201,21 +201,25 @@ def _parents(row: ProductRow | PsfRow) -> list[tuple[Type, str]]:
 
 
 def _made_of(row: ProductRow | PsfRow) -> Creation:
-    details, names = row.details, {"created_at", "file_sha256"}
-    if isinstance(row, PsfRow):
-        details = _provenance(row) | row.details
-        names |= {"name", "version", "status", "origin"}
+    details = _provenance(row) | row.details if isinstance(row, PsfRow) else row.details
     cards = row.details.get("cards") or {}
-    recorded = {"doi": cards.get("PSFDOI"), "citation": cards.get("PSFREF")}
-    recorded |= {
-        name: details.get(name) for name in ("job_id", "algorithm_version", "software_version", "libraries")
-    }
+    columns = (
+        "created_at",
+        "file_sha256",
+        "name",
+        "version",
+        "status",
+        "origin",
+    )  # a product has only the first two
+    entries = ("job_id", "algorithm_version", "software_version", "libraries")
     uploaded = isinstance(row, PsfRow) and row.origin == "uploaded"
     return Creation(
         kind=None if uploaded else kind_of_origin(_origin(row)).name,
         parameters=_parameters(row),
-        **{name: getattr(row, name) for name in names},
-        **recorded,
+        doi=cards.get("PSFDOI"),
+        citation=cards.get("PSFREF"),
+        **{name: getattr(row, name, None) for name in columns},
+        **{name: details.get(name) for name in entries},
     )
 
 

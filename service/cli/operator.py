@@ -188,7 +188,7 @@ def check_command(sizes: bool, repairs: bool, data: Path | None) -> None:
         for fault in examine(catalogue, files, content=not sizes):
             count += 1
             bad = ", ".join(f"{state} {digest}" for digest, state in fault.files)
-            line = f"{fault.what:<8}  {fault.row.owner}  {fault.row.id}  {bad}"
+            line = f"{fault.row.thing():<8}  {fault.row.owner}  {fault.row.id}  {bad}"
             echo(f"{line}: {repair(fault, catalogue, files)}" if repairs else line)
     if count == 0:
         echo("all files are good")

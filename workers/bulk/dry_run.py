@@ -17,7 +17,7 @@ from pathlib import Path
 from pydantic import BaseModel, Field
 
 from psfcore.errors import DataError
-from psfcore.fits.blocks import BLOCK_BYTES, FitsLimits
+from psfcore.fits.blocks import BLOCK_BYTES
 from psfcore.fits.header import read_summary
 from workers.bulk.listing import found_files, no_images
 from workers.bulk.outputs import Source, target_of
@@ -209,10 +209,12 @@ class _DryRun:
         if image.uploaded:
             row = row_of(self._catalogue, ImageRow, image.source, self._run.owner)
             return Source(row.id, row.summary, row.filename or "image")
-        path, limits = Path(image.source), FitsLimits(max_pixels=self._settings.max_pixels)
+        path = Path(image.source)
         try:
             with archive_files.opened(path, archive_files.roots(self._settings.bulk_roots)) as file:
-                summary = dataclasses.asdict(read_summary(archive_files.reopened(file), limits))
+                summary = dataclasses.asdict(
+                    read_summary(archive_files.reopened(file), self._settings.image_limits)
+                )
                 return Source(NO_ID, summary, path.name, path)
         except OSError as error:
             raise archive_files.unreadable(error) from error

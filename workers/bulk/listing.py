@@ -137,7 +137,6 @@ def found_files(
     "path-not-allowed", "unreadable-folder", "too-many-images".
     """
     allowed = archive_files.roots(settings.bulk_roots)
-    limits = FitsLimits(max_pixels=settings.max_pixels)
     seen = set(known)
     first = 0 if after is None else after.pattern
     for number, files in enumerate(request.files[first:], first):
@@ -145,7 +144,7 @@ def found_files(
         for entry in archive_files.find(files.glob, allowed, names):
             path, image = str(entry.path), None
             if (entry.matches or entry.error) and path not in seen:
-                image = _listed_one(allowed, limits, entry, files.where)
+                image = _listed_one(allowed, settings.image_limits, entry, files.where)
             if image is not None:
                 listed += 1
                 if len(request.files) > 1:

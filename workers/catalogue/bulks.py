@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, Select, case, delete, func, insert, null, select, update
+from sqlalchemy import ColumnElement, Select, case, delete, exists, func, insert, null, select, update
 from sqlalchemy.orm import Session
 
 from psfcore.errors import DataError
@@ -241,10 +241,9 @@ class Bulks(Queries):
                 phase = session.scalar(select(BulkRow.phase).where(BulkRow.id == bulk_id))
                 if phase not in AT_WORK or not _is_held(session, lease.token):
                     return None
-                item = (
-                    session.scalars(_lost_images(bulk_id)).first()
-                    or session.scalars(_waiting_images(bulk_id)).first()
-                )
+                lost = _next_image(bulk_id, BulkItemRow.state == ItemState.TAKEN, ~_IN_WORK)
+                waiting = _next_image(bulk_id, BulkItemRow.state == ItemState.WAITING)
+                item = session.scalars(lost).first() or session.scalars(waiting).first()
                 if item is None:
                     return None
                 if item.attempts < max_attempts:
@@ -315,20 +314,16 @@ def _values(bulk_id: str, position: int, image: BulkImage) -> Mapping[str, Any]:
     }
 
 
-def _waiting_images(bulk_id: str) -> Select[BulkItemRow]:
-    query = select(BulkItemRow).where(BulkItemRow.bulk_id == bulk_id, BulkItemRow.state == ItemState.WAITING)
+# The condition that the lease under which an image was taken is not lost.
+_IN_WORK = exists().where(
+    JobRow.id == BulkItemRow.job_id, JobRow.lease == BulkItemRow.token, JobRow.phase == Phase.EXECUTING
+)
+
+
+def _next_image(bulk_id: str, *conditions: ColumnElement[bool]) -> Select[BulkItemRow]:
+    """A query for the first image of a run that meets the conditions. It is locked."""
+    query = select(BulkItemRow).where(BulkItemRow.bulk_id == bulk_id, *conditions)
     # If two workers take an image at the same moment, they get different images.
-    return query.order_by(BulkItemRow.position).limit(1).with_for_update(skip_locked=True)
-
-
-def _lost_images(bulk_id: str) -> Select[BulkItemRow]:
-    """A query for an image that was taken under a lease that is now lost."""
-    held = select(JobRow.id).where(
-        JobRow.id == BulkItemRow.job_id, JobRow.lease == BulkItemRow.token, JobRow.phase == Phase.EXECUTING
-    )
-    query = select(BulkItemRow).where(
-        BulkItemRow.bulk_id == bulk_id, BulkItemRow.state == ItemState.TAKEN, ~held.exists()
-    )
     return query.order_by(BulkItemRow.position).limit(1).with_for_update(skip_locked=True)
 
 

@@ -255,7 +255,7 @@ class Jobs(Queries):
         ahead = [JobRow.phase == Phase.EXECUTING, JobRow.heartbeat_at > now + lease_s]
         started_at = case((JobRow.started_at > now, now), else_=JobRow.started_at)
         self._note(ahead, heartbeat_at=now, started_at=started_at)
-        silent = [JobRow.phase == Phase.EXECUTING, JobRow.heartbeat_at < self._database.now - lease_s]
+        silent = [JobRow.phase == Phase.EXECUTING, JobRow.heartbeat_at < now - lease_s]
         too_often = and_(JobRow.cancel_requested.is_(False), JobRow.attempt >= max_attempts)
         error = JobError(
             fault=Fault.INTERNAL,
@@ -263,14 +263,11 @@ class Jobs(Queries):
             message=f"the worker was lost {max_attempts} times while it ran this job; the job is not tried again: tell "
             "the operator",
         )
-        ended = {
-            "phase": Phase.ERROR,
-            "ended_at": self._database.now,
-            "lease": None,
-            "error": error.model_dump(mode="json"),
-        }
         with self._database.writing.begin() as session:
-            lost = update(JobRow).where(*silent, too_often).values(**ended)
+            lost = update(JobRow).where(*silent, too_often)
+            lost = lost.values(
+                phase=Phase.ERROR, ended_at=now, lease=None, error=error.model_dump(mode="json")
+            )
             for job_id in session.scalars(lost.returning(JobRow.id)):
                 log.error("job %s: %s (%s)", job_id, error.message, error.code)
         with self._database.writing.begin() as session:

@@ -18,9 +18,9 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from psfcore.errors import DataError
-from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.catalogue import Catalogue, Row
 from workers.catalogue.quotas import KEPT, WITH_FILES, FileRow
-from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, ReportRow, SolutionRow, TransitRow
+from workers.catalogue.tables import ImageRow, SolutionRow, TransitRow
 from workers.files.store import Blob, FileState, Store, StoreAway
 from workers.settings import Settings
 
@@ -54,13 +54,19 @@ def files_of(row: FileRow) -> list[tuple[str, int | None]]:
     return [(row.file_sha256, row.bytes), *((digest, None) for digest in further if digest is not None)]
 
 
-def intact(store: Store, row: ProductRow | PsfRow | ReportRow) -> bool:
-    """Whether the store has all files of a result, each with its recorded size. The content of the files is not read.
+def intact(store: Store, row: FileRow) -> bool:
+    """Whether the store has all files of a row, each with its recorded size. The content of the files is not read.
 
     Raises ``StoreAway``.
     """
     sizes = ((store.size(digest), expected) for digest, expected in files_of(row))
     return all(size is not None and expected in (None, size) for size, expected in sizes)
+
+
+def intact_row(catalogue: Catalogue, store: Store, table: type[Row], identity: str, owner: str) -> Row | None:
+    """The row of a result with this identity; None if there is none, or if one of its files is lost. Raises ``StoreAway``."""
+    row = catalogue.get(table, identity, owner)
+    return row if row is not None and intact(store, row) else None
 
 
 @dataclass(frozen=True)
@@ -69,11 +75,6 @@ class Fault:
 
     row: FileRow
     files: tuple[tuple[str, FileState], ...]
-
-    @property
-    def what(self) -> str:
-        """The kind of the row whose file is lost or damaged, for example "product"."""
-        return self.row.thing()
 
 
 def examine(catalogue: Catalogue, store: Store, *, content: bool = True) -> Iterator[Fault]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from importlib import import_module
 from typing import Any
 
@@ -221,14 +221,9 @@ class Runner:
             return self._error_of(job, error)
         return None
 
-    @contextmanager
-    def _limited(self, job: JobRow) -> Iterator[None]:
+    def _limited(self, job: JobRow) -> AbstractContextManager[None]:
         """Limit the memory of the block to the estimate of the job, if this process may be limited."""
-        if self._child is None:
-            yield
-            return
-        with self._child.limited(self._estimate_mib(job)):
-            yield
+        return nullcontext() if self._child is None else self._child.limited(self._estimate_mib(job))
 
     def _estimate_mib(self, job: JobRow) -> int:
         """The memory for which the job was admitted, MiB. Without an estimate, it is the operator's limit."""

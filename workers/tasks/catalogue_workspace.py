@@ -20,10 +20,10 @@ from workers.contract.identities import interpolated_psf_identity
 from workers.contract.jobs import JobError
 from workers.contract.kinds import KINDS, ResultType
 from workers.contract.requests import PsfBuild, ResolvedDeconvolve, ResolvedOnTransit
-from workers.files.garbage import ENTRIES, intact
+from workers.files.garbage import ENTRIES, intact, intact_row
 from workers.files.store import Store
 from workers.intake.compatibility import DEPRECATED_CODE, deprecated_warning, of_upload
-from workers.intake.repair import TABLES, there
+from workers.intake.repair import TABLES
 from workers.lookup import row_of
 from workers.settings import Settings
 from workers.stage_timer import StageTimer
@@ -75,7 +75,7 @@ class CatalogueWorkspace(Workspace):
 
     @property
     def limits(self) -> FitsLimits:
-        return FitsLimits(max_pixels=self.settings.max_pixels)
+        return self.settings.image_limits
 
     # Inputs -------------------------------------------------------------------------------------------
 
@@ -183,11 +183,10 @@ class CatalogueWorkspace(Workspace):
 
     def made(self, table: type[AnyResult], identity: str) -> AnyResult | None:
         """The row of the result of an earlier job; None if there is none or if one of its files is lost."""
-        row = self.catalogue.get(table, identity, self.owner)
-        return row if row is not None and intact(self.store, row) else None
+        return intact_row(self.catalogue, self.store, table, identity, self.owner)
 
     def has(self, result: ResultType, identity: str) -> bool:
-        return there(result, identity, self.owner, self.catalogue, self.store)
+        return self.made(TABLES[result], identity) is not None
 
     def add(self, result: Result) -> None:
         self.keep(result)

@@ -18,7 +18,7 @@ from psfcore.gap.library.registry import Added, added_effects, library_with
 from psfcore.gap.report.report import gap_report
 from psfcore.psf import Psf
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW
-from workers.contract.identities import corrected_psf_identity, diffraction_identity, gap_identity
+from workers.contract.identities import corrected_psf_identity, diffraction_identity
 from workers.contract.requests import ResolvedGapDiagnose
 from workers.tasks.results import provenance_of, psf_result, report_result
 from workers.tasks.transits import load_transit
@@ -47,7 +47,7 @@ def gap_diagnose(workspace: Workspace, request: ResolvedGapDiagnose, identity: s
         progress=workspace.report,
         solution=workspace.inverter(request),
     )
-    provenance = _provenance(request, parent, added, workspace.job_id)
+    provenance = {"report_id": identity, **_provenance(request, parent, added, workspace.job_id)}
     corrected_id = None
     if request.correct and found.corrected is not None:
         try:
@@ -124,7 +124,6 @@ def _provenance(
         None if parent is None else {"name": parent.name, "version": parent.version, "id": request.psf_id}
     )
     return {
-        "report_id": gap_identity(request),
         "started_from_psf": started,
         "diffraction_psf_id": diffraction_identity(request),
         "seed": request.seed,

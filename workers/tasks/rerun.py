@@ -6,7 +6,6 @@ The rows of products and PSFs in the catalogue are not changed: only the report 
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -144,8 +143,7 @@ def _save(
 def _made(workspace: CatalogueWorkspace, row: Thing) -> dict[str, Any]:
     made = lineage(workspace.catalogue, row).made
     assert isinstance(made, Creation)
-    told: dict[str, Any] = json.loads(made.model_dump_json(exclude={"parameters"}))
-    return told
+    return made.model_dump(mode="json", exclude={"parameters"})
 
 
 def _largest(compared: Mapping[str, Comparison]) -> float | None:
