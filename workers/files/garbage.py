@@ -97,7 +97,7 @@ def examine(catalogue: Catalogue, store: Store, *, content: bool = True) -> Iter
 
 
 @dataclass(frozen=True)
-class Collected:
+class Collection:
     """The result of a collection: the files of the store, and the removed files.
 
     removed: in a dry run, the files that would be removed.
@@ -121,7 +121,7 @@ def collect(
     dry_run: bool = False,
     even_most: bool = False,
     second_look_after_s: float = SECOND_LOOK_AFTER_S,
-) -> Collected:
+) -> Collection:
     """Remove files that were last stored more than ``older_than_s`` seconds ago, if no row, or only the row of an old
     solution, refers to them.
 
@@ -154,7 +154,7 @@ def collect(
     if not dry_run:
         catalogue.quotas.forget_solutions(solutions)
         old = _removed(old, catalogue, store, kept_before, second_look_after_s)
-    return Collected(len(there), sum(blob.bytes for blob in there.values()), tuple(old))
+    return Collection(len(there), sum(blob.bytes for blob in there.values()), tuple(old))
 
 
 def remove_unnamed(catalogue: Catalogue, store: Store, digests: Iterable[str]) -> None:

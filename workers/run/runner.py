@@ -94,17 +94,7 @@ class Runner:
             return
         with logs.bound(job=job.id, owner=job.owner), traces.of_job(job.id, job.kind):
             log.info("job %s: %s starts, attempt %d", job.id, job.kind, job.attempt)
-            settings = self._settings
-            attempt = Attempt(
-                self._catalogue,
-                lease,
-                settings.heartbeat_s,
-                self._stopping,
-                settings.max_job_s,
-                child=self._child,
-                cancel_s=settings.cancel_s,
-                silent_s=settings.silent_s,
-            )
+            attempt = Attempt(self._catalogue, lease, self._settings, self._stopping, self._child)
             try:
                 with attempt.beating(), listening(attempt.compiling):
                     self._attempt(job, lease, attempt)

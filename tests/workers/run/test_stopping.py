@@ -99,7 +99,7 @@ def test_a_heartbeat_that_failed_is_followed_by_another() -> None:
         return True
 
     catalogue = SimpleNamespace(jobs=SimpleNamespace(heartbeat=heartbeat))
-    attempt = Attempt(catalogue, Lease("job", "token"), 0.01, Stopping(), limit_s=60.0)  # type: ignore[arg-type]
+    attempt = Attempt(catalogue, Lease("job", "token"), Settings(heartbeat_s=0.01), Stopping())  # type: ignore[arg-type]
     with attempt.beating():
         assert third.wait(10.0), beats
     assert not attempt.stopped.is_set()
