@@ -17,7 +17,7 @@ MOST_SUCCESSORS = 32
 
 
 @dataclass(frozen=True)
-class Affected:
+class AffectedProduct:
     """A product, its PSF, and the certified PSF at the end of the PSF's chain of successors (None if there is none)."""
 
     product: ProductRow
@@ -37,7 +37,9 @@ class PageEnd:
 class AffectedProducts(Queries):
     """Products by the status of their PSF."""
 
-    def of_psf(self, psf: PsfRow, *, limit: int, after: tuple[float, str] | None = None) -> list[Affected]:
+    def of_psf(
+        self, psf: PsfRow, *, limit: int, after: tuple[float, str] | None = None
+    ) -> list[AffectedProduct]:
         """Products that were made with a PSF, newest first."""
         with self._database.reading() as session:
             return _affected(session, psf, limit, after)
@@ -49,13 +51,13 @@ class AffectedProducts(Queries):
 
     def page(
         self, owner: str, *, superseded: bool, limit: int, after: PageEnd | None = None
-    ) -> list[Affected]:
+    ) -> list[AffectedProduct]:
         """Products that were made with deprecated PSFs. superseded: only PSFs that have a successor.
 
         The method makes several queries, each of which reads only the rows that it returns. A single query with a join
         would be slower: it would sort all products of a PSF first.
         """
-        affected: list[Affected] = []
+        affected: list[AffectedProduct] = []
         with self._database.reading() as session:
             done = ""
             if after is not None:
@@ -85,12 +87,12 @@ def _next_psfs(owner: str, superseded: bool, after: str) -> Select[Any]:
 
 def _affected(
     session: Session, psf: PsfRow, limit: int, after: tuple[float, str] | None = None
-) -> list[Affected]:
+) -> list[AffectedProduct]:
     """Products of a PSF, newest first."""
     query = select(ProductRow).where(ProductRow.owner == psf.owner, ProductRow.psf_id == psf.id)
     rows = session.scalars(newest_first(query, ProductRow, limit, after)).all() if limit else ()
     redo_with = _last_successor(session, psf) if rows else None
-    return [Affected(row, psf, redo_with) for row in rows]
+    return [AffectedProduct(row, psf, redo_with) for row in rows]
 
 
 def _last_successor(session: Session, psf: PsfRow) -> PsfRow | None:

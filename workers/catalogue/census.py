@@ -22,7 +22,7 @@ from workers.catalogue.tables import (
     WorkerRow,
 )
 from workers.contract.jobs import Phase, Queue
-from workers.stage_timer import Spent
+from workers.stage_timer import StageTime
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ class Census(Queries):
 class KeptStageTimes(Queries):
     """The total time of each stage by kind of job, and the durations of the newest jobs."""
 
-    def add(self, kind: str, spent: Mapping[str, Spent]) -> None:
+    def add(self, kind: str, spent: Mapping[str, StageTime]) -> None:
         """Add the times of one attempt of a job of this kind."""
         # The rows are sorted, so that two attempts that write at the same moment cannot deadlock.
         rows = [
@@ -163,10 +163,10 @@ class KeptStageTimes(Queries):
             }
             session.execute(new.on_conflict_do_update(index_elements=["kind", "stage"], set_=sums))
 
-    def all(self) -> dict[tuple[str, str], Spent]:
+    def all(self) -> dict[tuple[str, str], StageTime]:
         """Total times by kind of job and stage."""
         query = select(StageTimeRow).order_by(StageTimeRow.kind, StageTimeRow.stage)
-        return {(row.kind, row.stage): Spent(row.seconds, row.steps) for row in self._database.all(query)}
+        return {(row.kind, row.stage): StageTime(row.seconds, row.steps) for row in self._database.all(query)}
 
     def run_times(self, kind: str, limit: int) -> list[tuple[float, float]]:
         """Estimated time (before the measured factor) and duration of the newest completed jobs of a kind, s."""

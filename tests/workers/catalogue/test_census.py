@@ -21,7 +21,7 @@ from workers.catalogue.census import FileTally
 from workers.catalogue.changes import Moment
 from workers.catalogue.tables import DEFAULT_OWNER, ImageRow, JobRow
 from workers.contract.jobs import Phase
-from workers.stage_timer import Spent
+from workers.stage_timer import StageTime
 from workers.tasks.catalogue_workspace import CatalogueWorkspace
 
 
@@ -49,16 +49,16 @@ def test_the_counts_of_files_and_jobs(catalogue: Catalogue) -> None:
 def test_times_of_many_attempts_are_summed(catalogue: Catalogue) -> None:
     def add(_: int) -> None:
         for _ in range(10):
-            catalogue.stage_times.add("deconvolve", {"b": Spent(0.5, 2), "a": Spent(0.25, 1)})
+            catalogue.stage_times.add("deconvolve", {"b": StageTime(0.5, 2), "a": StageTime(0.25, 1)})
 
     with ThreadPoolExecutor(4) as pool:
         list(pool.map(add, range(4)))
-    catalogue.stage_times.add("bulk", {"a": Spent(1.0, 0)})
+    catalogue.stage_times.add("bulk", {"a": StageTime(1.0, 0)})
     catalogue.stage_times.add("bulk", {})
     assert catalogue.stage_times.all() == {
-        ("bulk", "a"): Spent(1.0, 0),
-        ("deconvolve", "a"): Spent(10.0, 40),
-        ("deconvolve", "b"): Spent(20.0, 80),
+        ("bulk", "a"): StageTime(1.0, 0),
+        ("deconvolve", "a"): StageTime(10.0, 40),
+        ("deconvolve", "b"): StageTime(20.0, 80),
     }
 
 
