@@ -410,19 +410,19 @@ class WithDiffraction(Parameters):
     diffraction_recipe: PsfBuild | None = None
 
 
-class ResolvedPsfFit(PsfFit, WithDiffraction):
+class ResolvedPsfFit(WithDiffraction, PsfFit):
     """A fit with the recipe of the diffraction PSF."""
 
 
-class ResolvedCrossValidate(CrossValidate, WithDiffraction):
+class ResolvedCrossValidate(WithDiffraction, CrossValidate):
     """A cross-validation with the recipe of the diffraction PSF."""
 
 
-class ResolvedReport(Report, WithDiffraction):
+class ResolvedReport(WithDiffraction, Report):
     """A report with the recipe of the diffraction PSF."""
 
 
-class ResolvedGapDiagnose(GapDiagnose, WithDiffraction):
+class ResolvedGapDiagnose(WithDiffraction, GapDiagnose):
     """A diagnosis with the recipe of the diffraction PSF and the effects that the operator adds to the library."""
 
     added_effects: tuple[str, ...] = ()
