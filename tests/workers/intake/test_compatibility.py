@@ -21,7 +21,7 @@ from workers.bulk.image import statistics_of
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, TransitRow
 from workers.contract.identities import psf_identity
-from workers.contract.kinds import JobRequest, Kind, Result
+from workers.contract.kinds import JobRequest, Kind, ResultType
 from workers.contract.psf_status import Pin, StatusChange
 from workers.contract.requests import Parameters, PsfBuild, PsfFit, ResolvedDeconvolve
 from workers.intake import requests
@@ -217,7 +217,7 @@ class Two(Parameters):
 
 
 def resolved(catalogue: Catalogue, **parameters: str) -> Parameters:
-    kind = Kind("two", task="", result=Result.REPORT, parameters=Two, resolved=Two)
+    kind = Kind("two", task="", result=ResultType.REPORT, parameters=Two, resolved=Two)
     return resolve_by_ids(Submission(kind, Two(**parameters), catalogue, OWNER, ()))
 
 
