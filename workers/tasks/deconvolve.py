@@ -34,6 +34,7 @@ def deconvolve(workspace: Workspace, request: ResolvedDeconvolve, _identity: str
     """
     file = workspace.image_file(request.image_id)
     workspace.add(make(workspace, request, lambda: load(workspace, request, file)))
+    workspace.report("saving", 1, 1)
 
 
 def load(workspace: Workspace, request: ResolvedDeconvolve, path: Path) -> Image:
