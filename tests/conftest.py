@@ -36,7 +36,7 @@ LONGEST_FIRST = (
     "service/pages/browser/test_bulk.py",
     "service/pages/browser/test_product.py",
     "service/cli/test_transits.py",
-    "workers/files/test_collection.py",
+    "workers/files/test_garbage.py",
     "service/pages/browser/test_way_through.py",
     "workers/run/test_stopping.py",
     "service/api/bulk/test_bulk.py",

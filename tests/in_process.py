@@ -13,7 +13,7 @@ import pytest
 from pydantic import TypeAdapter
 
 from psfcore.files import sha256_of
-from psfcore.fits.header import FitsLimits, read_summary
+from psfcore.fits.header import read_summary
 from psfcore.fits.psfs import stated_id
 from psfcore.fits.stored_psf import check_is_psf
 from psfcore.tables import lookup
@@ -30,7 +30,7 @@ from workers.files.store import Store
 from workers.intake.compatibility import details_now
 from workers.intake.requests import resolve
 from workers.intake.uploads import Upload, image_row, transit_row, uploaded_psf_row
-from workers.rows import row_of
+from workers.lookup import row_of
 from workers.run.attempt import Attempt
 from workers.run.runner import Runner
 from workers.settings import Settings
@@ -61,7 +61,7 @@ class InProcess(Operations):
         self.catalogue = Catalogue(settings.catalogue_url)
         self.catalogue.upgrade()
         self._runner = Runner(settings, self.catalogue, self.store)
-        self._limits = FitsLimits(max_pixels=settings.max_pixels)
+        self._limits = settings.image_limits
 
     def close(self) -> None:
         self.catalogue.close()

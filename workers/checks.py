@@ -8,8 +8,9 @@ from __future__ import annotations
 import re
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryFile
 from threading import Lock, Thread
@@ -43,14 +44,16 @@ def database(catalogue: Catalogue) -> None:
     The last check reads the whole file of an SQLite database. The longer this takes, the less often it is done. While a
     large file is being read, it counts as good.
     """
-    _ask(catalogue.ping)
-    _ask(catalogue.check_writable)
+    answers(catalogue)
+    with _asking():
+        catalogue.check_writable()
     _pages.setdefault(catalogue, _Pages()).check(catalogue)
 
 
 def answers(catalogue: Catalogue) -> None:
     """Check that the database answers."""
-    _ask(catalogue.ping)
+    with _asking():
+        catalogue.clock()
 
 
 class _Pages:
@@ -83,20 +86,20 @@ class _Pages:
         self._fault, self._good_until = None, ended + (ended - started) / PAGES_SHARE
 
 
-def _ask(question: Callable[[], None]) -> None:
+@contextmanager
+def _asking() -> Iterator[None]:
+    """Turn the errors of the database into ``Unusable``."""
     try:
-        question()
+        yield
     except SQLAlchemyError as error:
-        raise (_damage(error) if damaged(error) else _silent(error)) from error
+        if damaged(error):
+            raise _damage(error) from error
+        state = "accepts no changes" if sqlstate_of(error) == READ_ONLY else "does not answer"
+        raise Unusable(f"the database {state} ({_kind(error)})") from error
 
 
 def _damage(error: SQLAlchemyError) -> Unusable:
     return Unusable(f"the database is damaged ({_kind(error)}); restore a copy of it")
-
-
-def _silent(error: SQLAlchemyError) -> Unusable:
-    state = "accepts no changes" if sqlstate_of(error) == READ_ONLY else "does not answer"
-    return Unusable(f"the database {state} ({_kind(error)})")
 
 
 def storage(folder: Path, min_free_mib: int) -> None:
@@ -146,10 +149,8 @@ def broker(settings: Settings) -> None:
 
 def embedded_worker(catalogue: Catalogue, settings: Settings) -> None:
     """Check that a worker has announced itself."""
-    try:
+    with _asking():
         workers = catalogue.census.workers(settings.lease_s)
-    except SQLAlchemyError as error:
-        raise _silent(error) from error
     if not workers:
         raise Unusable(f"no worker has announced itself for {settings.lease_s:g} s")
 
@@ -160,15 +161,9 @@ def jobs(catalogue: Catalogue, settings: Settings) -> None:
     Workers that run jobs are busy, and workers that have just started may take a job soon: neither is a fault.
     """
     idle_s = RESUBMISSIONS * settings.resubmit_s
-    try:
-        if not catalogue.jobs.nobody_works(idle_s):
-            return
-        left = catalogue.census.count_untaken(idle_s)
-        if not left:
-            return
-        workers = catalogue.census.workers(settings.lease_s)
-    except SQLAlchemyError as error:
-        raise _silent(error) from error
+    with _asking():
+        left = catalogue.census.count_untaken(idle_s) if catalogue.jobs.nobody_works(idle_s) else 0
+        workers = catalogue.census.workers(settings.lease_s) if left else ()
     if any(worker.started_at < time.time() - idle_s for worker in workers):
         raise Unusable(f"jobs wait ({left}), but the workers have taken none for {idle_s:g} s")
 
@@ -186,24 +181,24 @@ class Watch:
     def ask(self, name: str, check: Callable[[], None]) -> Future[str]:
         """The result of a check, which may come later or never: "ok", or what is wrong."""
         with self._lock:
-            asked = self._running.get(name)
-            if asked is None or asked.done():
-                asked = self._running[name] = Future()
-                Thread(target=_answer, args=(asked, check), name=f"check of {name}", daemon=True).start()
-            return asked
+            answer = self._running.get(name)
+            if answer is None or answer.done():
+                answer = self._running[name] = Future()
+                Thread(target=_answer, args=(answer, check), name=f"check of {name}", daemon=True).start()
+            return answer
 
 
-def _answer(asked: Future[str], check: Callable[[], None]) -> None:
-    asked.set_running_or_notify_cancel()  # nobody can cancel it from now on
+def _answer(answer: Future[str], check: Callable[[], None]) -> None:
+    answer.set_running_or_notify_cancel()  # nobody can cancel it from now on
     try:
         check()
     except Unusable as fault:
-        asked.set_result(str(fault))
+        answer.set_result(str(fault))
     except BaseException as error:
-        asked.set_exception(error)
+        answer.set_exception(error)
         raise
     else:
-        asked.set_result(OK)
+        answer.set_result(OK)
 
 
 def needed(settings: Settings, catalogue: Catalogue, store: Store) -> dict[str, Callable[[], None]]:

@@ -43,7 +43,7 @@ MOST_THINGS = 200
 Type = Literal["product", "psf", "image", "transit", "report", "instrument-file"]
 
 
-class Made(BaseModel):
+class Creation(BaseModel):
     """How a product, PSF, ... was made. A field is null if it was not recorded when the job ran."""
 
     created_at: float
@@ -71,7 +71,7 @@ class Ancestor(BaseModel):
     there: bool = Field(
         description="whether the catalogue still contains the thing; false for an instrument file, because its text is in the PSF file"
     )
-    made: Made | None = Field(None, description="null for an upload and for a deleted thing")
+    made: Creation | None = Field(None, description="null for an upload and for a deleted thing")
     weight: float | None = Field(
         None,
         description="the weight of this PSF in the PSF that was interpolated between it and another PSF; null for other parents",
@@ -200,22 +200,26 @@ def _parents(row: ProductRow | PsfRow) -> list[tuple[Type, str]]:
     return [(kind, identity) for kind, identity in inputs if identity is not None]
 
 
-def _made_of(row: ProductRow | PsfRow) -> Made:
-    details, names = row.details, {"created_at", "file_sha256"}
-    if isinstance(row, PsfRow):
-        details = _provenance(row) | row.details
-        names |= {"name", "version", "status", "origin"}
+def _made_of(row: ProductRow | PsfRow) -> Creation:
+    details = _provenance(row) | row.details if isinstance(row, PsfRow) else row.details
     cards = row.details.get("cards") or {}
-    recorded = {"doi": cards.get("PSFDOI"), "citation": cards.get("PSFREF")}
-    recorded |= {
-        name: details.get(name) for name in ("job_id", "algorithm_version", "software_version", "libraries")
-    }
+    columns = (
+        "created_at",
+        "file_sha256",
+        "name",
+        "version",
+        "status",
+        "origin",
+    )  # a product has only the first two
+    entries = ("job_id", "algorithm_version", "software_version", "libraries")
     uploaded = isinstance(row, PsfRow) and row.origin == "uploaded"
-    return Made(
+    return Creation(
         kind=None if uploaded else kind_of_origin(_origin(row)).name,
         parameters=_parameters(row),
-        **{name: getattr(row, name) for name in names},
-        **recorded,
+        doi=cards.get("PSFDOI"),
+        citation=cards.get("PSFREF"),
+        **{name: getattr(row, name, None) for name in columns},
+        **{name: details.get(name) for name in entries},
     )
 
 
@@ -277,7 +281,7 @@ class _Document:
             self.prov.wasDerivedFrom(name, above, activity)
         return name
 
-    def _activity(self, one: Ancestor, made: Made) -> str:
+    def _activity(self, one: Ancestor, made: Creation) -> str:
         """The activity that made an entry, with its plan, parameters and agents."""
         job_id = made.job_id or f"of-{one.id}"
         name, plan = f"job:{job_id}", f"kind:{made.kind}"
@@ -302,7 +306,7 @@ class _Document:
             self._parameter(name, f"parameter:{job_id}.{key}", key, value)
         return name
 
-    def _software(self, made: Made) -> str:
+    def _software(self, made: Creation) -> str:
         """The agent for the version of heliopsf and of its libraries."""
         version, libraries = made.software_version or "unknown", made.libraries or {}
         name = f"software:heliopsf-{version}"

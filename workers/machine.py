@@ -38,7 +38,7 @@ def memory_bytes(cgroups: Path = CGROUPS, membership: Path = MEMBERSHIP) -> int:
     cgroups: where the system shows the limits of cgroups. membership: the file that names the cgroups of this process.
     """
     machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    return min([machine, *(limited.limit for limited in _limits(cgroups, membership))])
+    return min([machine, *(cgroup.limit for cgroup in _limits(cgroups, membership))])
 
 
 def free_bytes(cgroups: Path = CGROUPS, membership: Path = MEMBERSHIP, meminfo: Path = MEMINFO) -> int:
@@ -49,7 +49,7 @@ def free_bytes(cgroups: Path = CGROUPS, membership: Path = MEMBERSHIP, meminfo: 
     """
     shown = re.search(r"^MemAvailable:\s*(\d+) kB$", _text(meminfo), re.MULTILINE)
     machine = memory_bytes(cgroups, membership) if shown is None else 1024 * int(shown[1])
-    return max(0, min([machine, *(limited.free for limited in _limits(cgroups, membership))]))
+    return max(0, min([machine, *(cgroup.free for cgroup in _limits(cgroups, membership))]))
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ _V2 = _Version("memory.max", "memory.current", "inactive_file")
 
 
 @dataclass(frozen=True)
-class _Limited:
+class _Cgroup:
     """A cgroup with a memory limit, bytes."""
 
     folder: Path
@@ -83,7 +83,7 @@ class _Limited:
         return self.limit - (int(used) if used.isdecimal() else 0) + (int(caches[1]) if caches else 0)
 
 
-def _limits(cgroups: Path, membership: Path) -> Iterator[_Limited]:
+def _limits(cgroups: Path, membership: Path) -> Iterator[_Cgroup]:
     """The memory limits of the cgroups of this process and of the cgroups above them, in both versions of cgroups."""
     for line in _text(membership).splitlines():
         number, controllers, path = line.split(":", 2)
@@ -99,7 +99,7 @@ def _limits(cgroups: Path, membership: Path) -> Iterator[_Limited]:
         for folder in (below, *below.parents):
             limit = _text(top / folder / version.limit).strip()
             if limit.isdecimal():  # the text is "max" without a limit
-                yield _Limited(top / folder, version, int(limit))
+                yield _Cgroup(top / folder, version, int(limit))
 
 
 def _text(file: Path) -> str:

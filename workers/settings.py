@@ -325,6 +325,11 @@ class Settings(BaseSettings):
         return self.max_psf_mib * 2**20
 
     @property
+    def image_limits(self) -> FitsLimits:
+        """Limits on the FITS files of images."""
+        return FitsLimits(max_pixels=self.max_pixels)
+
+    @property
     def psf_limits(self) -> FitsLimits:
         """Limits on the FITS files of PSFs."""
         return FitsLimits(max_pixels=self.max_psf_pixels)

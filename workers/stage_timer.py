@@ -24,7 +24,7 @@ _NUMBER = re.compile(r"[+-]?\d+(\.\d+)?")
 
 
 @dataclass
-class Spent:
+class StageTime:
     """Seconds spent in a stage, and the number of steps reported."""
 
     seconds: float = 0.0
@@ -38,7 +38,7 @@ class StageTimer:
     A report made during another report, in the same thread or in another one, is ignored.
     """
 
-    spent: dict[str, Spent] = field(default_factory=dict)
+    spent: dict[str, StageTime] = field(default_factory=dict)
     _stage: str = STARTING
     _since: float = field(default_factory=time.perf_counter)
     _last: tuple[str, int] = ("", 0)
@@ -66,7 +66,7 @@ class StageTimer:
         with self.step(stage, 0):
             pass
 
-    def end(self) -> Mapping[str, Spent]:
+    def end(self) -> Mapping[str, StageTime]:
         """The times of all stages, including the time since the last report."""
         self._add(self._stage)
         self._since = time.perf_counter()
@@ -75,9 +75,9 @@ class StageTimer:
     def _add(self, name: str) -> None:
         self._of(name).seconds += time.perf_counter() - self._since
 
-    def _of(self, name: str) -> Spent:
+    def _of(self, name: str) -> StageTime:
         known = name in self.spent or len(self.spent) < MOST_STAGES
-        return self.spent.setdefault(name if known else OTHERS, Spent())
+        return self.spent.setdefault(name if known else OTHERS, StageTime())
 
 
 def short(stage: str) -> str:

@@ -24,7 +24,7 @@ from workers.catalogue.bulk_progress import BATCH, BulkProgress
 from workers.catalogue.tables import BulkItemRow, BulkRow
 from workers.contract.bulk import STOPPED, BulkPhase, BulkRequest, ItemState
 from workers.contract.jobs import JobError
-from workers.rows import no_such
+from workers.lookup import no_such
 
 log = logging.getLogger(__name__)
 router = APIRouter(prefix="/v1/bulk", tags=["bulk"], responses=RESPONSES, route_class=KeyFirst)

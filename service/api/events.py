@@ -112,7 +112,7 @@ def _stream(request: Request, state: Shared, caller: Caller, follower: Follower)
         Kind("job", catalogue.job_changes, JobView.of),
         Kind("bulk", catalogue.bulk_changes, partial(BulkView.of, state=state)),
     ]
-    lookout = Lookout(caller.owner, kinds, catalogue.census.clock, partial(still_let_in, state))
+    lookout = Lookout(caller.owner, kinds, catalogue.clock, partial(still_let_in, state))
     lookout = state.lookouts.setdefault(caller.owner, lookout)
 
     async def texts() -> AsyncIterator[str]:

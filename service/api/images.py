@@ -17,9 +17,9 @@ from service.http.problems import RESPONSES
 from service.http.state import Shared
 from service.views import JobView, ProductView, RowView
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow
-from workers.contract.kinds import KINDS
+from workers.contract.kinds import REQUESTS
 from workers.contract.requests import Identity, Rerun
-from workers.files.collection import files_of, remove_unnamed
+from workers.files.garbage import files_of, remove_unnamed
 from workers.intake.compatibility import details_now
 from workers.lineage import Ancestor, Format, lineage, provenance_text
 
@@ -221,7 +221,7 @@ def rerun_product(product_id: Identity, response: Response, caller: Submitting, 
 def _rerun(
     of: Literal["product", "psf"], identity: str, response: Response, caller: Submitting, state: Shared
 ) -> JobView:
-    request = KINDS["rerun"].request(kind="rerun", parameters=Rerun(of=of, id=identity))
+    request = REQUESTS["rerun"](kind="rerun", parameters=Rerun(of=of, id=identity))
     return submit_job(request, response, caller, state)
 
 

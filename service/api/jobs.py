@@ -19,11 +19,12 @@ from workers.catalogue.tables import JobRow
 from workers.contract.jobs import Phase, Queue
 from workers.contract.kinds import KINDS, JobRequest, queue_of
 from workers.contract.requests import Deconvolve, ResolvedDeconvolve
+from workers.files.garbage import intact_row
 from workers.intake import estimates
-from workers.intake.again import reopened, there, without_results
 from workers.intake.psf_choice import ChosenPsf, reasoned_psf
+from workers.intake.repair import TABLES, reopened, without_results
 from workers.intake.requests import resolve
-from workers.rows import no_such
+from workers.lookup import no_such
 
 log = logging.getLogger(__name__)
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"], responses=RESPONSES, route_class=KeyFirst)
@@ -131,7 +132,7 @@ def estimate_job(body: JobRequest, caller: Submitting, state: Shared) -> Estimat
     if body.kind == "deconvolve":
         wanted, resolved = cast(Deconvolve, body.parameters), ResolvedDeconvolve.model_validate(parameters)
         psf = reasoned_psf(wanted, resolved, state.catalogue, caller.owner)
-    existing = there(result, result_id, caller.owner, state.catalogue, state.store)
+    existing = intact_row(state.catalogue, state.store, TABLES[result], result_id, caller.owner)
     return EstimateView(
         parameters=parameters,
         result_id=result_id,

@@ -21,7 +21,7 @@ from service.http.state import Shared
 from service.views import RowView
 from workers.catalogue.access import LABEL_LENGTH, OWNER, Scope, TooManyKeys
 from workers.catalogue.tables import KeyRow
-from workers.rows import no_such
+from workers.lookup import no_such
 from workers.texts import Line
 
 MOST_KEYS = 100  # an owner with this number of valid keys cannot make more

@@ -185,7 +185,7 @@ def _decoded(state: State, digest: str, name: str) -> Plane:
     def decode(target: BinaryIO) -> Decoded:
         check_disk(state)
         # The checksum of the whole file is verified, because browsers keep the pixels for a long time.
-        return decode_plane(files.path_of(state.store, digest), name, state.limits, target)
+        return decode_plane(files.path_of(state.store, digest), name, state.settings.image_limits, target)
 
     return state.planes.decoded((digest, name), decode)
 
@@ -234,7 +234,7 @@ async def _headers(request: Request, state: Shared, owner: str, digest: str, siz
         return same
 
     def read() -> Response:
-        listed = all_cards(files.path_of(state.store, digest, size), state.limits)
+        listed = all_cards(files.path_of(state.store, digest, size), state.settings.image_limits)
         content = [{"index": one.index, "name": one.name, "cards": one.cards} for one in listed]
         return JSONResponse(content, headers=sent)
 

@@ -15,7 +15,7 @@ from service.http.paging import Page, Paging, finite, identity, place
 from service.http.problems import RESPONSES, as_problems
 from service.http.state import Shared, State
 from service.views import PastChange, RowView, was_certified
-from workers.catalogue.affected import Affected, Place
+from workers.catalogue.affected import AffectedProduct, PageEnd
 from workers.catalogue.contexts import NAME
 from workers.catalogue.tables import PsfContextRow, PsfRow
 from workers.contract.psf_status import Pin, Reason, StatusChange
@@ -205,7 +205,7 @@ class AffectedView(RowView):
     )
 
     @classmethod
-    def of(cls, one: Affected) -> AffectedView:
+    def of(cls, one: AffectedProduct) -> AffectedView:
         """The description of an affected product and its PSF, from their rows in the catalogue."""
         return cls.of_columns(
             one.product,
@@ -225,7 +225,7 @@ def list_affected(
 ) -> Page[AffectedView]:
     """Products whose PSF is deprecated, sorted by PSF; the products of each PSF are listed newest first."""
     at = place(paging.cursor, identity, finite, identity)
-    after = None if at is None else Place(*at)
+    after = None if at is None else PageEnd(*at)
     rows = state.catalogue.affected.page(
         caller.owner, superseded=superseded, limit=paging.limit + 1, after=after
     )
@@ -241,7 +241,7 @@ def list_affected_by_psf(
     return paging.page(state.catalogue.affected.of_psf(psf, **paging.query), AffectedView.of, _place)
 
 
-def _place(one: Affected) -> tuple[str, ...]:
+def _place(one: AffectedProduct) -> tuple[str, ...]:
     """The place of a product in its cursor."""
     return repr(one.product.created_at), one.product.id
 

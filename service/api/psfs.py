@@ -23,7 +23,7 @@ from workers.catalogue.contexts import NOW
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import ImageRow, PsfRow
 from workers.contract.requests import Identity
-from workers.files.collection import remove_unnamed
+from workers.files.garbage import files_of, remove_unnamed
 from workers.intake.psf_choice import MOST_NAMED, SearchResult, look, look_for_image
 from workers.texts import Name
 from workers.versions import TIME, TOTAL, WORD, PsfStatus, iso, seconds
@@ -237,8 +237,7 @@ def delete_psf(psf_id: Identity, caller: Submitting, state: Shared) -> PsfView:
     """
     with as_problems():
         row = state.catalogue.delete_draft(psf_id, caller.owner)
-    named = (row.file_sha256, row.preview_sha256, row.details.get("tables_sha256"))
-    remove_unnamed(state.catalogue, state.store, [digest for digest in named if digest is not None])
+    remove_unnamed(state.catalogue, state.store, [digest for digest, _ in files_of(row)])
     log.info("PSF %s: deleted by %s", psf_id, caller.name)
     return PsfView.of(row)
 

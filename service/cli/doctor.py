@@ -289,7 +289,7 @@ def database(settings: Settings) -> Finding:
     started = time.perf_counter()
     try:
         with closing(catalogue):
-            catalogue.ping()
+            catalogue.clock()
             took_ms = 1e3 * (time.perf_counter() - started)
             catalogue.check_pages()
     except SQLAlchemyError as error:
@@ -330,7 +330,7 @@ def changes(_settings: Settings, catalogue: Catalogue) -> Finding:
 def clock(_settings: Settings, catalogue: Catalogue) -> Finding:
     """Do the clocks of this machine and of the database agree? Leases use the clock of the database."""
     before = time.time()
-    theirs = catalogue.census.clock()
+    theirs = catalogue.clock()
     after = time.time()
     apart = theirs - (before + after) / 2
     found = f"the database's clock is {abs(apart):.2f} s {'ahead' if apart > 0 else 'behind'}"

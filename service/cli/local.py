@@ -55,8 +55,8 @@ from workers.contract.requests import (
 )
 from workers.contract.suggestions import explained
 from workers.intake.costs import job_s
+from workers.lookup import no_such
 from workers.machine import cores
-from workers.rows import no_such
 from workers.settings import Settings
 from workers.stage_timer import StageTimer
 from workers.versions import name_of_upload

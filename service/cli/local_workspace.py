@@ -24,8 +24,8 @@ from psfcore.transit.archive import ArchiveContents, unpack
 from workers.contract.identities import recipe_of
 from workers.contract.kinds import ResultType
 from workers.contract.requests import Deconvolve, PsfBuild, ResolvedDeconvolve
+from workers.lookup import no_such
 from workers.machine import cores, psf_cache
-from workers.rows import no_such
 from workers.settings import Settings
 from workers.stage_timer import StageTimer
 from workers.tasks.deconvolve import possible_psfs

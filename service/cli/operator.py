@@ -23,13 +23,13 @@ from service.cli.psf.query import NAMES, SOURCE, brought
 from workers import checks
 from workers.catalogue.access import MEANINGS, OWNER, OWNER_RULE, Scope
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.owners import MIB, MOST_QUOTA_MIB, Usage
+from workers.catalogue.quotas import MIB, MOST_QUOTA_MIB, Usage
 from workers.catalogue.schema import SchemaError, SchemaStatus
 from workers.catalogue.tables import DEFAULT_OWNER, KeyRow
-from workers.files.collection import collect, examine
+from workers.files.garbage import collect, examine
 from workers.files.modes import keep_private, private_folder
 from workers.files.store import open_store
-from workers.intake.again import repair
+from workers.intake.repair import repair
 from workers.intake.uploads import Upload, uploaded_psf_row
 from workers.settings import Settings
 from workers.texts import check_line
@@ -198,7 +198,7 @@ def check_command(settings: Settings, catalogue: Catalogue, sizes: bool, repairs
     for fault in examine(catalogue, files, content=not sizes):
         count += 1
         bad = ", ".join(f"{state} {digest}" for digest, state in fault.files)
-        line = f"{fault.what:<8}  {fault.row.owner}  {fault.row.id}  {bad}"
+        line = f"{fault.row.thing():<8}  {fault.row.owner}  {fault.row.id}  {bad}"
         echo(f"{line}: {repair(fault, catalogue, files)}" if repairs else line)
     if count == 0:
         echo("all files are good")
@@ -212,7 +212,7 @@ def check_command(settings: Settings, catalogue: Catalogue, sizes: bool, repairs
 @on_catalogue
 def usage(settings: Settings, catalogue: Catalogue) -> None:
     """Show how much each owner stores, and the quota of each owner."""
-    for one in catalogue.owners.all(settings.quota_mib):
+    for one in catalogue.quotas.all(settings.quota_mib):
         echo(_line(one))
 
 
@@ -225,8 +225,8 @@ def quota(settings: Settings, catalogue: Catalogue, owner: str, mib: int | None,
     """Set the quota of an OWNER to MIB; 0: unlimited."""
     if (mib is None) != as_all:
         raise click.UsageError("expected either a number of MiB or --default")
-    catalogue.owners.set_quota(owner, mib)
-    echo(_line(catalogue.owners.usage(owner, settings.quota_mib)))
+    catalogue.quotas.set_quota(owner, mib)
+    echo(_line(catalogue.quotas.usage(owner, settings.quota_mib)))
 
 
 @store.group("psf", short_help="Add published PSFs to a service.")

@@ -386,6 +386,4 @@ def psf_limits() -> FitsLimits:
 
 def limits() -> FitsLimits:
     """The limits on FITS files that a command reads, from HELIOPSF_MAX_PIXELS."""
-    from psfcore.fits.blocks import FitsLimits
-
-    return FitsLimits(max_pixels=read_settings().max_pixels)
+    return read_settings().image_limits

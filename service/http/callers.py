@@ -49,7 +49,7 @@ from workers.catalogue.tables import (
     TransitRow,
 )
 from workers.contract.requests import SHORT_ID
-from workers.rows import no_such
+from workers.lookup import no_such
 
 ACT_FOR = "X-Owner"  # names the owner that an administrator acts for
 FORM_TOKEN = "X-Form-Token"

@@ -253,7 +253,7 @@ IMAGE = Kind(
     *_FITS,
     ImageRow,
     *_FITS_START,
-    lambda path, state: read_summary(path, state.limits),
+    lambda path, state: read_summary(path, state.settings.image_limits),
     image_row,
 )
 PSF = Kind("/v1/psfs", *_FITS, PsfRow, *_FITS_START, _psf_content, uploaded_psf_row, limit="max_psf_bytes")

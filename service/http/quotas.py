@@ -16,7 +16,7 @@ from service.http.rates import Bucket
 from service.http.state import State
 from workers import checks
 from workers.catalogue.catalogue import Row
-from workers.catalogue.owners import MIB, NOT_KEPT, OverQuota, Usage
+from workers.catalogue.quotas import MIB, NOT_KEPT, OverQuota, Usage
 from workers.files.partial_uploads import PartialUploads
 from workers.files.store import STORAGE_FULL
 
@@ -91,7 +91,7 @@ def check_room(state: State, owner: str) -> None:
 
 def _limited(state: State, owner: str, but: str | None = None) -> Usage | None:
     """The usage of an owner who has a limit, with the open uploads except ``but``; None if there is no limit."""
-    usage = state.catalogue.owners.limited(owner, state.settings.quota_mib)
+    usage = state.catalogue.quotas.limited(owner, state.settings.quota_mib)
     if usage is None:
         return None
     open_bytes = PartialUploads(state.settings.data_dir).declared_bytes(owner, but)

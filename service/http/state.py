@@ -14,7 +14,6 @@ from weakref import WeakValueDictionary
 
 from fastapi import Depends, Request
 
-from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.viewing.planes import Planes
 from service.client.errors import is_loopback
 from service.http.gate import Gate
@@ -24,7 +23,7 @@ from service.http.rates import AtOnce, Rates
 from workers.catalogue.catalogue import Catalogue, Row
 from workers.checks import Watch
 from workers.files.store import Store
-from workers.rows import row_of
+from workers.lookup import row_of
 from workers.settings import Settings
 
 if TYPE_CHECKING:
@@ -100,11 +99,6 @@ class State:
     )  # by owner, as long as they have streams
     watch: Watch = field(default_factory=Watch)
     started_at: float = field(default_factory=time.time)
-
-    @property
-    def limits(self) -> FitsLimits:
-        """Limits of accepted FITS files."""
-        return FitsLimits(max_pixels=self.settings.max_pixels)
 
     def row(self, table: type[Row], identity: str, owner: str) -> Row:
         """The owner's row with this id. Raises ``Problem`` 404 if there is none."""

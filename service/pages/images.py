@@ -114,7 +114,7 @@ def _add_sample(state: State, caller: Caller) -> ImageRow:
         take(shipped.stat().st_size)
         copy = Path(shutil.copy(shipped, folder))  # the store moves the file that it gets
         digest = hashlib.sha256(copy.read_bytes()).hexdigest()
-        summary = read_summary(copy, state.limits)
+        summary = read_summary(copy, state.settings.image_limits)
         upload = Upload(caller.owner, digest, copy.stat().st_size, SAMPLE)
         row, _ = take.keep(copy, digest, image_row(upload, summary))
     return row

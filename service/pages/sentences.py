@@ -8,7 +8,7 @@ from typing import Any
 
 from psfcore.instruments.files import assumed_in
 from service.http.problems import Problem
-from workers.rows import NAMES
+from workers.lookup import NAMES
 
 # The labels in the forms, for fields whose label differs from their name.
 _FIELDS = {

@@ -39,7 +39,7 @@ from service.vo.parameters import (
 )
 from workers.catalogue.tables import JobRow
 from workers.contract.jobs import JobError, Phase
-from workers.rows import no_such
+from workers.lookup import no_such
 
 MAX_RUN_ID = 256
 MOST = 2**31 - 1

@@ -237,7 +237,7 @@ async def get_region(request: Request, caller: Reading, state: Shared, fields: F
     def write(path: Path, target: BinaryIO) -> None:
         from psfcore.fits.viewing.regions import write_cutout  # loads the numerical libraries
 
-        write_cutout(path, _region(shape, numbers, frame), state.limits, target)
+        write_cutout(path, _region(shape, numbers, frame), state.settings.image_limits, target)
 
     part, filename = f"{ANSWERS_VERSION} {shape} {numbers} {frame}", f"product-{row.id[:12]}-cutout.fits"
     return await cutout_of(request, state, row, part, write, filename=filename)

@@ -21,7 +21,7 @@ from tests.conftest import write_image
 from tests.service.conftest import upload
 from workers.catalogue.catalogue import Catalogue
 from workers.settings import Settings
-from workers.stage_timer import Spent
+from workers.stage_timer import StageTime
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
 DASHBOARD = json.loads((DEPLOY / "grafana" / "heliopsf.json").read_text("utf-8"))
@@ -44,7 +44,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, se
     with TestClient(create_app(settings)) as api:
         upload(api, folder / "image.fits")
         catalogue = Catalogue(settings.catalogue_url)  # as a worker would write it
-        catalogue.stage_times.add("deconvolve", {"reading": Spent(seconds=1.0, steps=1)})
+        catalogue.stage_times.add("deconvolve", {"reading": StageTime(seconds=1.0, steps=1)})
         catalogue.close()
         api.get("/v1/jobs").raise_for_status()
         answer = api.get("/metrics").text

@@ -239,7 +239,7 @@ def test_not_ready_where_files_cannot_be_written_or_the_database_is_away(
     def away() -> None:
         raise AWAY
 
-    monkeypatch.setattr(handles(api).catalogue, "ping", away)
+    monkeypatch.setattr(handles(api).catalogue, "clock", away)
     answer = api.get("/readyz")
     assert answer.status_code == 503 and "does not answer" in answer.json()["parts"]["database"]
     assert "s3cret" not in answer.text

@@ -11,7 +11,7 @@ from typing import Any
 
 from sqlalchemy import Engine, create_engine, event, text
 
-from workers.catalogue.affected import Place
+from workers.catalogue.affected import PageEnd
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import (
@@ -199,7 +199,7 @@ def _none_fits(archive: Archive, rng: random.Random) -> Any:
 def _affected(*, superseded: bool) -> Question:
     def ask(archive: Archive, rng: random.Random) -> Any:
         n = rng.randrange(archive.size.products)
-        after = Place(archive.psf_id(rng.randrange(archive.size.psfs)), 1e9 + n, archive.product_id(n))
+        after = PageEnd(archive.psf_id(rng.randrange(archive.size.psfs)), 1e9 + n, archive.product_id(n))
         return archive.catalogue.affected.page(OWNER, superseded=superseded, limit=51, after=after)
 
     return ask

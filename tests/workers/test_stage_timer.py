@@ -6,7 +6,7 @@ import pytest
 
 from psfcore.errors import DataError
 from tests.workers.conftest import Clock
-from workers.stage_timer import MOST_STAGES, OTHERS, STARTING, Spent, StageTimer, short
+from workers.stage_timer import MOST_STAGES, OTHERS, STARTING, StageTime, StageTimer, short
 
 
 def test_time_before_a_step_counts_for_its_stage(clock: Clock) -> None:
@@ -26,10 +26,10 @@ def test_time_before_a_step_counts_for_its_stage(clock: Clock) -> None:
                 clock.now += 1000.0
     clock.now += 64.0
     assert times.end() == {
-        STARTING: Spent(1.0, 0),
-        "reading": Spent(2.0, 0),
-        "deconvolving": Spent(28.0, 2),
-        "saving": Spent(96.0, 1),
+        STARTING: StageTime(1.0, 0),
+        "reading": StageTime(2.0, 0),
+        "deconvolving": StageTime(28.0, 2),
+        "saving": StageTime(96.0, 1),
     }
 
 

@@ -17,7 +17,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from workers.broker import app as queue
 from workers.bulk.runs import keep_turns
 from workers.catalogue.catalogue import Catalogue
-from workers.files.collection import retain, settle_old
+from workers.files.garbage import retain, settle_old
 from workers.files.store import Store
 from workers.settings import Settings
 

@@ -17,12 +17,12 @@ from pathlib import Path
 from pydantic import BaseModel, Field
 
 from psfcore.errors import DataError
-from psfcore.fits.blocks import BLOCK_BYTES, FitsLimits
+from psfcore.fits.blocks import BLOCK_BYTES
 from psfcore.fits.header import read_summary
 from workers.bulk.listing import found_files, no_images
 from workers.bulk.outputs import Source, target_of
 from workers.bulk.runs import new_run, resolved_image
-from workers.catalogue.bulks import Listed
+from workers.catalogue.bulks import BulkImage
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ImageRow, ProductRow
 from workers.contract.bulk import BulkRequest
@@ -31,7 +31,7 @@ from workers.contract.jobs import JobError
 from workers.contract.requests import ResolvedDeconvolve
 from workers.files import archive as archive_files
 from workers.intake import estimates
-from workers.rows import row_of
+from workers.lookup import row_of
 from workers.settings import Settings
 
 BUDGET_S = 20.0  # a dry run stops after this time, and reports what it found
@@ -134,9 +134,9 @@ class _DryRun:
         if time.monotonic() > self._ends_at:
             raise _OutOfTime
 
-    def _chosen(self, sample: int) -> list[Listed]:
+    def _chosen(self, sample: int) -> list[BulkImage]:
         """Count all images of the run, and choose a random sample of them. Raises the errors of listing."""
-        chosen: list[Listed] = []
+        chosen: list[BulkImage] = []
         chance = random.Random(0)
         try:
             for image in self._found():
@@ -152,15 +152,15 @@ class _DryRun:
             raise no_images()
         return chosen
 
-    def _found(self) -> Iterator[Listed]:
+    def _found(self) -> Iterator[BulkImage]:
         for identity in self._uploads:
-            yield Listed(identity, uploaded=True)
+            yield BulkImage(identity, uploaded=True)
         for _, image in found_files(self._request, self._settings):
             self._check_time()
             if image is not None:
                 yield image
 
-    def _examine(self, image: Listed) -> None:
+    def _examine(self, image: BulkImage) -> None:
         """Add the estimate of one image. Raises DataError if the run would refuse the image."""
         if image.error is not None:
             raise DataError(image.error.code, image.error.message)
@@ -185,7 +185,7 @@ class _DryRun:
             self._seconds += start_s * estimates.factor(estimates.BULK, start_s, catalogue)
             self._bytes += product_bytes(shape, resolved.error_draws)
 
-    def _target(self, image: Listed, source: Source, resolved: ResolvedDeconvolve) -> Path:
+    def _target(self, image: BulkImage, source: Source, resolved: ResolvedDeconvolve) -> Path:
         """The path of the product. Raises DataError if the layout gives no name, or the name of another examined image."""
         assert self._request.output is not None
         identity = product_identity(resolved)
@@ -205,14 +205,16 @@ class _DryRun:
             )
         return target
 
-    def _source(self, image: Listed) -> Source:
+    def _source(self, image: BulkImage) -> Source:
         if image.uploaded:
             row = row_of(self._catalogue, ImageRow, image.source, self._run.owner)
             return Source(row.id, row.summary, row.filename or "image")
-        path, limits = Path(image.source), FitsLimits(max_pixels=self._settings.max_pixels)
+        path = Path(image.source)
         try:
             with archive_files.opened(path, archive_files.roots(self._settings.bulk_roots)) as file:
-                summary = dataclasses.asdict(read_summary(archive_files.reopened(file), limits))
+                summary = dataclasses.asdict(
+                    read_summary(archive_files.reopened(file), self._settings.image_limits)
+                )
                 return Source(NO_ID, summary, path.name, path)
         except OSError as error:
             raise archive_files.unreadable(error) from error

@@ -16,7 +16,7 @@ from urllib.parse import quote, unquote_to_bytes
 
 from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits
-from workers.catalogue.bulks import NOT_UTF_8, TOO_LONG, Listed
+from workers.catalogue.bulks import NOT_UTF_8, TOO_LONG, BulkImage
 from workers.catalogue.tables import MOST_LETTERS, BulkRow
 from workers.contract.bulk import BulkWork, Condition
 from workers.contract.jobs import JobError
@@ -34,19 +34,19 @@ ADD_EVERY_S = (
 
 
 @dataclass(frozen=True)
-class Place:
+class SearchPosition:
     """How far the search for the files of a run has come. pattern: number of the pattern. names: see ``archive.Entry``."""
 
     pattern: int
-    names: archive_files.Place
+    names: archive_files.Position
 
     def stored(self) -> dict[str, Any]:
-        """The place as JSON. Names may have bytes that are not UTF-8, which PostgreSQL refuses; they are written as %FF."""
+        """The position as JSON. Names may have bytes that are not UTF-8, which PostgreSQL refuses; they are written as %FF."""
         return {"pattern": self.pattern, "names": [quote(os.fsencode(name), safe="") for name in self.names]}
 
     @classmethod
-    def of(cls, stored: dict[str, Any]) -> Place:
-        """The place that was stored."""
+    def of(cls, stored: dict[str, Any]) -> SearchPosition:
+        """The position that was stored."""
         names = tuple(os.fsdecode(unquote_to_bytes(name)) for name in stored["names"])
         return cls(stored["pattern"], names)
 
@@ -54,7 +54,7 @@ class Place:
 def list_files(
     workspace: CatalogueWorkspace, bulk: BulkRow, added: Callable[[], None], stops: Callable[[], bool]
 ) -> None:
-    """Add the files that the patterns of a bulk run match to its images, from the place where an earlier search ended.
+    """Add the files that the patterns of a bulk run match to its images, from the position where an earlier search ended.
 
     bulk: the row that ``Bulks.begin_listing`` returned for the lease of the workspace. added: called after images were
     added. stops: whether the search must end now; another turn then continues it. An error that concerns all files
@@ -88,27 +88,27 @@ def _add_all(
     """Search and add images in batches. Returns whether the search came to its end. Raises DataError."""
     bulks, request, lease = workspace.catalogue.bulks, BulkWork.model_validate(bulk.request), workspace.lease
     assert lease is not None
-    place = None if bulk.listed_to is None else Place.of(bulk.listed_to)
-    several = place is not None and len(request.files) > 1
+    position = None if bulk.listed_to is None else SearchPosition.of(bulk.listed_to)
+    several = position is not None and len(request.files) > 1
     # A path that the catalogue cannot store is not known again: it may then fail twice, once for each pattern.
     known = bulks.progress.sources(bulk.id) if several else frozenset[str]()
-    batch: list[Listed] = []
+    batch: list[BulkImage] = []
     add_at = time.monotonic() + ADD_EVERY_S
 
     def add() -> bool:
         nonlocal add_at
         add_at = time.monotonic() + ADD_EVERY_S
-        if place is None:
+        if position is None:
             return True
-        if not bulks.add_listed(bulk.id, lease, batch, place.stored()):
+        if not bulks.add_listed(bulk.id, lease, batch, position.stored()):
             return False
         batch.clear()
         added()
         return True
 
     try:
-        for reached, image in found_files(request, workspace.settings, place, known, bulk.total):
-            place = reached
+        for reached, image in found_files(request, workspace.settings, position, known, bulk.total):
+            position = reached
             if image is not None:
                 batch.append(image)
             stop = stops()
@@ -125,19 +125,18 @@ def _add_all(
 def found_files(
     request: BulkWork,
     settings: Settings,
-    after: Place | None = None,
+    after: SearchPosition | None = None,
     known: frozenset[str] = frozenset(),
     listed: int = 0,
-) -> Iterator[tuple[Place, Listed | None]]:
+) -> Iterator[tuple[SearchPosition, BulkImage | None]]:
     """Search the files that match the patterns of a request; each file is found once even if several patterns match it.
 
-    Each step of the search looks at one folder or entry: its place comes with the image that was found there, or None.
-    A file that cannot be used comes with its error. after: continue a search that ended after this place. known: paths
+    Each step of the search looks at one folder or entry: its position comes with the image that was found there, or None.
+    A file that cannot be used comes with its error. after: continue a search that ended after this position. known: paths
     that it found, if there are several patterns. listed: number of images that are listed. Raises DataError "bad-path",
     "path-not-allowed", "unreadable-folder", "too-many-images".
     """
     allowed = archive_files.roots(settings.bulk_roots)
-    limits = FitsLimits(max_pixels=settings.max_pixels)
     seen = set(known)
     first = 0 if after is None else after.pattern
     for number, files in enumerate(request.files[first:], first):
@@ -145,7 +144,7 @@ def found_files(
         for entry in archive_files.find(files.glob, allowed, names):
             path, image = str(entry.path), None
             if (entry.matches or entry.error) and path not in seen:
-                image = _listed_one(allowed, limits, entry, files.where)
+                image = _listed_one(allowed, settings.image_limits, entry, files.where)
             if image is not None:
                 listed += 1
                 if len(request.files) > 1:
@@ -155,12 +154,12 @@ def found_files(
                     "too-many-images",
                     f"expected at most {MOST_IMAGES} images in a bulk run; the patterns match more: split the request",
                 )
-            yield Place(number, entry.place), image
+            yield SearchPosition(number, entry.position), image
 
 
 def _listed_one(
     allowed: Sequence[Path], limits: FitsLimits, entry: archive_files.Entry, where: dict[str, Condition]
-) -> Listed | None:
+) -> BulkImage | None:
     """An entry of a folder as an image of the run, with an error if the file cannot be used; None if its header does not match."""
     failure = entry.error
     if failure is None and where:
@@ -176,7 +175,7 @@ def _listed_one(
     failure = _path_error(entry.path, source) or failure
     if len(source) > MOST_LETTERS:
         source = source[: MOST_LETTERS - 1] + "…"
-    return Listed(source, uploaded=False, error=None if failure is None else JobError.of(failure))
+    return BulkImage(source, uploaded=False, error=None if failure is None else JobError.of(failure))
 
 
 def _path_error(path: Path, source: str) -> DataError | None:

@@ -20,12 +20,12 @@ from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import BulkRow, ImageRow, JobRow, PsfRow
 from workers.contract.bulk import BulkPhase, BulkRequest, BulkWork
 from workers.contract.identities import canonical_hash
-from workers.contract.jobs import Fault, JobError, Phase, Queue
+from workers.contract.jobs import ENDED, Fault, JobError, Queue
 from workers.contract.requests import Deconvolve, ResolvedDeconvolve
 from workers.files import archive as archive_files
 from workers.files.store import STORAGE_FULL
 from workers.intake.requests import resolved_deconvolution
-from workers.rows import no_such, row_of
+from workers.lookup import no_such, row_of
 from workers.settings import Settings
 
 KIND = "bulk"
@@ -108,9 +108,9 @@ def keep_turns(catalogue: Catalogue, settings: Settings) -> None:
     """Queue the turns that every active bulk run needs; delete the turns that ended."""
     turns = catalogue.jobs.of_kind(KIND)
     for turn in turns:
-        if Phase(turn.phase).ended:
+        if turn.phase in ENDED:
             _forget(catalogue, turn)
-    live = {(turn.owner, turn.request_key) for turn in turns if not Phase(turn.phase).ended}
+    live = {(turn.owner, turn.request_key) for turn in turns if turn.phase not in ENDED}
     processes = len(catalogue.census.workers(settings.lease_s))
     for bulk in catalogue.bulks.at_work():
         left = bulk.total - bulk.done - bulk.failed

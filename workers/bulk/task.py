@@ -129,7 +129,7 @@ class _Turn:
     def _stopped_for_quota(self) -> bool:
         """Stop the run if its owner's quota is used up. Returns whether it was stopped. The run can be resumed when there is room."""
         workspace = self._workspace
-        usage = workspace.catalogue.owners.limited(workspace.owner, workspace.settings.quota_mib)
+        usage = workspace.catalogue.quotas.limited(workspace.owner, workspace.settings.quota_mib)
         if usage is None or not usage.full:
             return False
         if not BulkWork.model_validate(self._bulk.request).keeps_products:

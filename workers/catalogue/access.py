@@ -24,7 +24,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from workers.catalogue.database import Database, Queries, is_away, newest_first
-from workers.catalogue.owners import lock_owner
+from workers.catalogue.quotas import lock_owner
 from workers.catalogue.tables import Base, KeyRow
 
 log = logging.getLogger(__name__)
@@ -237,12 +237,10 @@ class Sessions:
         with self._database.reading() as session:
             row = session.get(SessionRow, _hash(token))
             key = None if row is None else session.get(KeyRow, row.key_id)
+        if key is not None:  # the reason why a key is not valid says more than "session-ended"
+            self._keys.check_valid(key)
         if row is None or key is None or row.expires_at <= time.time():
-            # If the key is not valid either, check_valid raises the reason, which says more than "session-ended".
-            if key is not None:
-                self._keys.check_valid(key)
             raise KeyRefused("session-ended", "expected an open session; yours has ended: log in again")
-        self._keys.check_valid(key)
         return row, key
 
     def is_open(self, identity: str) -> bool:

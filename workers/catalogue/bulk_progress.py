@@ -66,9 +66,7 @@ class BulkProgress(Queries):
 
     def to_look_at(self, bulk_id: str, score: float) -> int:
         """Number of done images with an artefact score of ``score`` or more."""
-        query = select(func.count()).select_from(BulkItemRow)
-        query = query.where(BulkItemRow.bulk_id == bulk_id, BulkItemRow.score >= score)
-        return self._database.first(query) or 0
+        return self._database.count(BulkItemRow, BulkItemRow.bulk_id == bulk_id, BulkItemRow.score >= score)
 
     def items(
         self, bulk_id: str, state: ItemState, *, after: int = -1, limit: int = BATCH

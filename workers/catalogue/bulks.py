@@ -13,15 +13,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Delete, Select, Update, case, delete, func, insert, null, select, update
-from sqlalchemy.engine import CursorResult
+from sqlalchemy import ColumnElement, Select, case, delete, exists, func, insert, null, select, update
 from sqlalchemy.orm import Session
 
 from psfcore.errors import DataError
 from workers.catalogue.bulk_progress import BATCH, BulkProgress
-from workers.catalogue.database import Database, Queries
+from workers.catalogue.database import Database, Queries, execute
 from workers.catalogue.jobs import Lease
-from workers.catalogue.owners import lock_owner
+from workers.catalogue.quotas import lock_owner
 from workers.catalogue.tables import BulkItemRow, BulkRow, JobRow
 from workers.contract.bulk import AT_WORK, DELETABLE, OPEN, STOPPED, BulkPhase, ItemState
 from workers.contract.jobs import Fault, JobError, Phase
@@ -36,7 +35,7 @@ LOST = JobError(
 
 
 @dataclass(frozen=True)
-class Listed:
+class BulkImage:
     """An image of a run, or the error if it cannot be used."""
 
     source: str
@@ -80,7 +79,7 @@ class Bulks(Queries):
                 return existing, False
             session.add(row)
             session.flush()
-            _add(session, row.id, 0, [Listed(one, True) for one in uploaded])
+            _add(session, row.id, 0, [BulkImage(one, True) for one in uploaded])
             return row, True
 
     def pause(self, bulk_id: str) -> bool:
@@ -129,7 +128,7 @@ class Bulks(Queries):
                 BulkItemRow.error["code"].as_string().not_in((NOT_UTF_8, TOO_LONG)),
             )
             waiting = {"state": ItemState.WAITING, "attempts": 0, "ended_at": None, "error": None}
-            changed = _execute(session, again.values(**waiting))
+            changed = execute(session, again.values(**waiting))
             bulk.failed -= changed
             if not changed or bulk.phase != BulkPhase.COMPLETED:
                 return changed
@@ -169,7 +168,7 @@ class Bulks(Queries):
             lock_owner(session, bulk.owner)
             positions = session.scalars(next_ones).all()
             if not positions:
-                _execute(session, delete(BulkRow).where(BulkRow.id == bulk.id))
+                execute(session, delete(BulkRow).where(BulkRow.id == bulk.id))
                 return False
             batch = delete(BulkItemRow).where(here, BulkItemRow.position.between(positions[0], positions[-1]))
             statement = batch.returning(BulkItemRow.state, BulkItemRow.reused)
@@ -181,7 +180,7 @@ class Bulks(Queries):
                 "reused": BulkRow.reused - sum(reused for _, reused in rows),
                 "failed": BulkRow.failed - states.count(ItemState.FAILED),
             }
-            _execute(session, update(BulkRow).where(BulkRow.id == bulk.id).values(**fewer))
+            execute(session, update(BulkRow).where(BulkRow.id == bulk.id).values(**fewer))
             return True
 
     # Listing ------------------------------------------------------------------------------------------
@@ -201,7 +200,7 @@ class Bulks(Queries):
             return bulk
 
     def add_listed(
-        self, bulk_id: str, lease: Lease, images: Sequence[Listed], listed_to: Mapping[str, Any]
+        self, bulk_id: str, lease: Lease, images: Sequence[BulkImage], listed_to: Mapping[str, Any]
     ) -> bool:
         """Add images to a run. Returns False if another lease now lists the files, or if the run is not LISTING.
 
@@ -242,10 +241,9 @@ class Bulks(Queries):
                 phase = session.scalar(select(BulkRow.phase).where(BulkRow.id == bulk_id))
                 if phase not in AT_WORK or not _is_held(session, lease.token):
                     return None
-                item = (
-                    session.scalars(_lost_images(bulk_id)).first()
-                    or session.scalars(_waiting_images(bulk_id)).first()
-                )
+                lost = _next_image(bulk_id, BulkItemRow.state == ItemState.TAKEN, ~_IN_WORK)
+                waiting = _next_image(bulk_id, BulkItemRow.state == ItemState.WAITING)
+                item = session.scalars(lost).first() or session.scalars(waiting).first()
                 if item is None:
                     return None
                 if item.attempts < max_attempts:
@@ -260,7 +258,7 @@ class Bulks(Queries):
     def release(self, item: BulkItemRow) -> bool:
         """Give an image back, so that a worker can take it again. The attempt does not count."""
         values = {"state": ItemState.WAITING, "attempts": BulkItemRow.attempts - 1, "token": None}
-        return bool(self._database.change(_update_held(item).values(**values)))
+        return self._database.set(BulkItemRow, _held(item), **values)
 
     def finish(self, item: BulkItemRow, *, reused: bool, **values: Any) -> bool:
         """Record that an image is done."""
@@ -273,15 +271,16 @@ class Bulks(Queries):
 
     def _end(self, item: BulkItemRow, values: Mapping[str, Any], **counts: int) -> bool:
         with self._database.writing.begin() as session:
-            ended = _update_held(item).values(ended_at=time.time(), token=None, **values)
-            if not _execute(session, ended):
+            ended = update(BulkItemRow).where(*_held(item))
+            if not execute(session, ended.values(ended_at=time.time(), token=None, **values)):
                 return False
             _count(session, item.bulk_id, **counts)
             return True
 
     def _set(self, bulk_id: str, phases: Iterable[BulkPhase], **values: Any) -> bool:
-        changed = update(BulkRow).where(BulkRow.id == bulk_id, BulkRow.phase.in_(sorted(phases)))
-        return bool(self._database.change(changed.values(**values)))
+        return self._database.set(
+            BulkRow, [BulkRow.id == bulk_id, BulkRow.phase.in_(sorted(phases))], **values
+        )
 
 
 def new_id() -> str:
@@ -295,14 +294,14 @@ def _equal_open(row: BulkRow) -> Select[BulkRow]:
     return select(BulkRow).where(*same, BulkRow.phase.in_(sorted(OPEN)))
 
 
-def _add(session: Session, bulk_id: str, first: int, images: Sequence[Listed]) -> None:
+def _add(session: Session, bulk_id: str, first: int, images: Sequence[BulkImage]) -> None:
     """Insert images at position ``first`` and the positions after it, in batches."""
     for at in range(0, len(images), BATCH):
         batch = enumerate(images[at : at + BATCH], first + at)
         session.execute(insert(BulkItemRow), [_values(bulk_id, number, image) for number, image in batch])
 
 
-def _values(bulk_id: str, position: int, image: Listed) -> Mapping[str, Any]:
+def _values(bulk_id: str, position: int, image: BulkImage) -> Mapping[str, Any]:
     failed = image.error is not None
     return {
         "bulk_id": bulk_id,
@@ -315,20 +314,16 @@ def _values(bulk_id: str, position: int, image: Listed) -> Mapping[str, Any]:
     }
 
 
-def _waiting_images(bulk_id: str) -> Select[BulkItemRow]:
-    query = select(BulkItemRow).where(BulkItemRow.bulk_id == bulk_id, BulkItemRow.state == ItemState.WAITING)
+# The condition that the lease under which an image was taken is not lost.
+_IN_WORK = exists().where(
+    JobRow.id == BulkItemRow.job_id, JobRow.lease == BulkItemRow.token, JobRow.phase == Phase.EXECUTING
+)
+
+
+def _next_image(bulk_id: str, *conditions: ColumnElement[bool]) -> Select[BulkItemRow]:
+    """A query for the first image of a run that meets the conditions. It is locked."""
+    query = select(BulkItemRow).where(BulkItemRow.bulk_id == bulk_id, *conditions)
     # If two workers take an image at the same moment, they get different images.
-    return query.order_by(BulkItemRow.position).limit(1).with_for_update(skip_locked=True)
-
-
-def _lost_images(bulk_id: str) -> Select[BulkItemRow]:
-    """A query for an image that was taken under a lease that is now lost."""
-    held = select(JobRow.id).where(
-        JobRow.id == BulkItemRow.job_id, JobRow.lease == BulkItemRow.token, JobRow.phase == Phase.EXECUTING
-    )
-    query = select(BulkItemRow).where(
-        BulkItemRow.bulk_id == bulk_id, BulkItemRow.state == ItemState.TAKEN, ~held.exists()
-    )
     return query.order_by(BulkItemRow.position).limit(1).with_for_update(skip_locked=True)
 
 
@@ -344,27 +339,20 @@ def _listed_by(session: Session, bulk_id: str, lease: Lease) -> BulkRow | None:
     return bulk if bulk and bulk.phase == BulkPhase.LISTING and bulk.lister == lease.token else None
 
 
-def _update_held(item: BulkItemRow) -> Update:
-    """An update of an image that changes it only if the worker still has the right to work on it."""
-    return update(BulkItemRow).where(
+def _held(item: BulkItemRow) -> list[ColumnElement[bool]]:
+    """The conditions that the worker still has the right to work on an image."""
+    return [
         BulkItemRow.bulk_id == item.bulk_id,
         BulkItemRow.position == item.position,
         BulkItemRow.state == ItemState.TAKEN,
         BulkItemRow.token == item.token,
-    )
-
-
-def _execute(session: Session, statement: Update | Delete) -> int:
-    """Change rows; returns their number."""
-    result = session.execute(statement.execution_options(synchronize_session=False))
-    assert isinstance(result, CursorResult)
-    return result.rowcount
+    ]
 
 
 def _count(session: Session, bulk_id: str, **counts: int) -> None:
     """Add to the counts of a run, and end it if no image is left."""
     more = {name: getattr(BulkRow, name) + count for name, count in counts.items()}
-    _execute(session, update(BulkRow).where(BulkRow.id == bulk_id).values(**more))
+    execute(session, update(BulkRow).where(BulkRow.id == bulk_id).values(**more))
     _end_if_done(session, bulk_id)
 
 
@@ -376,4 +364,4 @@ def _end_if_done(session: Session, bulk_id: str) -> None:
         BulkRow.listed,
         BulkRow.done + BulkRow.failed == BulkRow.total,
     )
-    _execute(session, done.values(phase=BulkPhase.COMPLETED, ended_at=time.time()))
+    execute(session, done.values(phase=BulkPhase.COMPLETED, ended_at=time.time()))

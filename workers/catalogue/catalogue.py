@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from sqlalchemy import Select, String, cast, create_engine, false, select, update
+from sqlalchemy import Select, String, cast, create_engine, false, select
 from sqlalchemy.exc import DatabaseError, IntegrityError
 from sqlalchemy.orm import Session
 from sqlalchemy.orm.attributes import flag_modified
@@ -26,8 +26,8 @@ from workers.catalogue.changes import changes_of_bulks, changes_of_jobs
 from workers.catalogue.contexts import Contexts, Series
 from workers.catalogue.database import Database, begins_with, newest_first
 from workers.catalogue.jobs import Jobs, Parts
-from workers.catalogue.owners import NamedFiles, Owners, hold_to_quota, lock_owner
 from workers.catalogue.psfs import Psfs, existing_psf
+from workers.catalogue.quotas import NamedFiles, Quotas, hold_to_quota, lock_owner
 from workers.catalogue.schema import Schema
 from workers.catalogue.tables import (
     BulkRow,
@@ -50,7 +50,7 @@ from workers.contract.jobs import ENDED, Phase
 from workers.versions import PsfStatus
 
 Row = TypeVar("Row", ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, SolutionRow)
-Made = TypeVar("Made", ProductRow, PsfRow, ReportRow)
+AnyResult = TypeVar("AnyResult", ProductRow, PsfRow, ReportRow)
 AnyRow = TypeVar(
     "AnyRow", ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, JobRow, PsfContextRow, BulkRow
 )
@@ -83,7 +83,7 @@ class Catalogue:
         self.stage_times = KeptStageTimes(self._database)
         self.keys = Keys(self._database)
         self.sessions = Sessions(self._database, self.keys)
-        self.owners = Owners(self._database)
+        self.quotas = Quotas(self._database)
         self.named_files = NamedFiles(self._database)
 
     def upgrade(self) -> Path | None:
@@ -97,13 +97,14 @@ class Catalogue:
         """Close all connections."""
         self._database.engine.dispose()
 
-    def ping(self) -> None:
-        """Raise ``sqlalchemy.exc.SQLAlchemyError`` if the database does not answer."""
-        self._database.clock()
+    def clock(self) -> float:
+        """The time of the database's clock, in seconds since 1970. Raises ``sqlalchemy.exc.SQLAlchemyError`` if the
+        database does not answer."""
+        return self._database.clock()
 
     def check_writable(self) -> None:
         """Raise ``sqlalchemy.exc.SQLAlchemyError`` if the database refuses changes. Changes nothing."""
-        self._database.change(update(WorkerRow).where(false()).values(version=""))
+        self._database.set(WorkerRow, [false()], version="")
 
     def check_pages(self) -> None:
         """Raise ``sqlalchemy.exc.DatabaseError`` if the file of an SQLite database is damaged.
@@ -124,7 +125,7 @@ class Catalogue:
 
         quota_mib: the limit for owners who have no individual limit; None: no limit applies. If the file does not fit,
         the owner's oldest kept solutions are removed until it fits. If it would not fit even without any kept solution,
-        nothing is added or removed, and ``workers.catalogue.owners.OverQuota`` is raised.
+        nothing is added or removed, and ``workers.catalogue.quotas.OverQuota`` is raised.
         """
         attempts = 0
         while True:
@@ -145,7 +146,7 @@ class Catalogue:
                 if attempts == _ATTEMPTS:
                     raise
 
-    def refile(self, row: Made) -> Made:
+    def refile(self, row: AnyResult) -> AnyResult:
         """Let the existing row with this identity refer to the files of ``row``; returns the existing row.
 
         If there is no such row any more, ``row`` is added and returned.
@@ -199,7 +200,7 @@ class Catalogue:
         """Remove a row with a file from the catalogue; returns the row, or None if it was not there.
 
         Its bytes no longer count for the owner, and a later identical request makes it again. Its files stay until
-        ``workers.files.collection`` removes them, because other rows may refer to the same files.
+        ``workers.files.garbage`` removes them, because other rows may refer to the same files.
         """
         with self._database.writing.begin() as session:
             row = session.get(table, (owner, identity), with_for_update=True)

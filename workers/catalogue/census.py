@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from sqlalchemy import ColumnElement, case, delete, func, literal, select
+from sqlalchemy import case, delete, func, literal, select
 
 from workers.catalogue.database import Queries, insert_into
 from workers.catalogue.jobs import no_equal_at_work
-from workers.catalogue.owners import FileRow
+from workers.catalogue.quotas import FileRow
 from workers.catalogue.tables import (
     ImageRow,
     JobRow,
@@ -22,7 +22,7 @@ from workers.catalogue.tables import (
     WorkerRow,
 )
 from workers.contract.jobs import Phase, Queue
-from workers.stage_timer import Spent
+from workers.stage_timer import StageTime
 
 
 @dataclass(frozen=True)
@@ -120,11 +120,12 @@ class Census(Queries):
         """Number of executing jobs whose worker has been silent for longer than the lease."""
         now = self._database.now
         heard = JobRow.heartbeat_at.between(now - lease_s, now + lease_s)
-        return self._count_jobs(JobRow.phase == Phase.EXECUTING, ~heard)
+        return self._database.count(JobRow, JobRow.phase == Phase.EXECUTING, ~heard)
 
     def count_unsubmitted(self, older_than_s: float) -> int:
         """Number of queued jobs that could start, but were not given to the broker within ``older_than_s``."""
-        return self._count_jobs(
+        return self._database.count(
+            JobRow,
             JobRow.phase == Phase.QUEUED,
             JobRow.submitted_at.is_(None),
             JobRow.created_at < self._database.now - older_than_s,
@@ -134,24 +135,18 @@ class Census(Queries):
     def count_untaken(self, older_than_s: float) -> int:
         """Number of queued jobs that are older than ``older_than_s``, and that were given to the broker more than once
         since they were queued."""
-        return self._count_jobs(
+        return self._database.count(
+            JobRow,
             JobRow.phase == Phase.QUEUED,
             JobRow.submissions > 1,
             JobRow.created_at < self._database.now - older_than_s,
         )
 
-    def _count_jobs(self, *conditions: ColumnElement[bool]) -> int:
-        return self._database.first(select(func.count()).select_from(JobRow).where(*conditions)) or 0
-
-    def clock(self) -> float:
-        """The time of the database's clock, in seconds since 1970."""
-        return self._database.clock()
-
 
 class KeptStageTimes(Queries):
     """The total time of each stage by kind of job, and the durations of the newest jobs."""
 
-    def add(self, kind: str, spent: Mapping[str, Spent]) -> None:
+    def add(self, kind: str, spent: Mapping[str, StageTime]) -> None:
         """Add the times of one attempt of a job of this kind."""
         # The rows are sorted, so that two attempts that write at the same moment cannot deadlock.
         rows = [
@@ -168,10 +163,10 @@ class KeptStageTimes(Queries):
             }
             session.execute(new.on_conflict_do_update(index_elements=["kind", "stage"], set_=sums))
 
-    def all(self) -> dict[tuple[str, str], Spent]:
+    def all(self) -> dict[tuple[str, str], StageTime]:
         """Total times by kind of job and stage."""
         query = select(StageTimeRow).order_by(StageTimeRow.kind, StageTimeRow.stage)
-        return {(row.kind, row.stage): Spent(row.seconds, row.steps) for row in self._database.all(query)}
+        return {(row.kind, row.stage): StageTime(row.seconds, row.steps) for row in self._database.all(query)}
 
     def run_times(self, kind: str, limit: int) -> list[tuple[float, float]]:
         """Estimated time (before the measured factor) and duration of the newest completed jobs of a kind, s."""

@@ -269,7 +269,7 @@ class Contexts(Queries):
         query = select(DefaultContextRow).where(DefaultContextRow.owner == owner)
         return self._database.all(query.order_by(DefaultContextRow.number.desc()).limit(limit))
 
-    def asked_for(self, context: str | None, owner: str) -> PsfContextRow | None:
+    def for_request(self, context: str | None, owner: str) -> PsfContextRow | None:
         """The context for a request that gives an id, a name, NOW or None.
 
         For NOW, which means no context, returns None. For None, returns the owner's default context, or None if there

@@ -19,8 +19,10 @@ from sqlalchemy import (
     and_,
     create_engine,
     event,
+    func,
     select,
     tuple_,
+    update,
 )
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import CursorResult
@@ -93,6 +95,10 @@ class Database:
         with self.reading() as session:
             return session.scalars(select(self.now)).one()
 
+    def count(self, table: type[Any], *conditions: ColumnElement[bool]) -> int:
+        """The number of rows that meet all conditions."""
+        return self.first(select(func.count()).select_from(table).where(*conditions)) or 0
+
     def all(self, query: Select[Value]) -> Sequence[Value]:
         """All rows, or values of the only column, that a query selects."""
         with self.reading() as session:
@@ -120,9 +126,11 @@ class Database:
     def change(self, statement: Update | Delete) -> int:
         """Run one UPDATE or DELETE in a separate transaction; returns the number of changed rows."""
         with self.writing.begin() as session:
-            result = session.execute(statement)
-            assert isinstance(result, CursorResult)
-            return result.rowcount
+            return execute(session, statement)
+
+    def set(self, table: type[Any], conditions: Sequence[Any], **values: Any) -> bool:
+        """Set columns of the rows that meet all conditions, by one UPDATE; returns whether it changed a row."""
+        return self.change(update(table).where(*conditions).values(**values)) > 0
 
 
 class Queries:
@@ -130,6 +138,13 @@ class Queries:
 
     def __init__(self, database: Database) -> None:
         self._database = database
+
+
+def execute(session: Session, statement: Update | Delete) -> int:
+    """Run one UPDATE or DELETE in a transaction; returns the number of changed rows."""
+    result = session.execute(statement.execution_options(synchronize_session=False))
+    assert isinstance(result, CursorResult)
+    return result.rowcount
 
 
 def sqlstate_of(error: BaseException) -> str | None:

@@ -108,7 +108,7 @@ class Jobs(Queries):
         order = list(Queue)
         if row.phase == Phase.QUEUED and order.index(queue) < order.index(Queue(row.queue)):
             waiting = [JobRow.id == row.id, JobRow.phase == Phase.QUEUED]
-            if self._set(waiting, queue=queue, submitted_at=None, submissions=0):
+            if self._database.set(JobRow, waiting, queue=queue, submitted_at=None, submissions=0):
                 row.queue, row.submitted_at = queue, None
         return row
 
@@ -185,7 +185,8 @@ class Jobs(Queries):
         remaining time of the job is estimated from them.
         """
         new_count = or_(JobRow.count_at.is_(None), JobRow.steps != steps, JobRow.step > step)
-        return self._set(
+        return self._database.set(
+            JobRow,
             [*_held(lease), JobRow.cancel_requested.is_(False)],
             count_at=case((new_count, self._database.now), else_=JobRow.count_at),
             count_step=case((new_count, step), else_=JobRow.count_step),
@@ -209,7 +210,7 @@ class Jobs(Queries):
 
     def _end(self, lease: Lease, phase: Phase, *conditions: ColumnElement[bool], **values: Any) -> bool:
         ended = {"phase": phase, "ended_at": self._database.now, "lease": None}
-        return self._set([*_held(lease), *conditions], **ended, **values)
+        return self._database.set(JobRow, [*_held(lease), *conditions], **ended, **values)
 
     def requeue(self, lease: Lease) -> bool:
         """Queue an executing job again after a transient failure. Returns False if the lease is lost.
@@ -217,12 +218,13 @@ class Jobs(Queries):
         The job is submitted again after the waiting time of ``unsubmitted``. A cancelled job is aborted instead.
         """
         delay = {"submitted_at": self._database.now, "submissions": JobRow.attempt, "delayed": True}
-        return self._set(_held(lease), **self._again(), **delay)
+        return self._database.set(JobRow, _held(lease), **self._again(), **delay)
 
     def cancel(self, job_id: str) -> None:
         """Abort a pending or queued job, and tell the worker of an executing job to stop. An ended job does not change."""
         at_work = JobRow.phase == Phase.EXECUTING
-        self._set(  # one statement, because between two statements the job could be claimed or queued again
+        self._database.set(
+            JobRow,  # one statement, because between two statements the job could be claimed or queued again
             [JobRow.id == job_id, JobRow.phase.in_((Phase.PENDING, Phase.QUEUED, Phase.EXECUTING))],
             phase=case((at_work, JobRow.phase), else_=Phase.ABORTED.value),
             ended_at=case((at_work, JobRow.ended_at), else_=self._database.now),
@@ -232,7 +234,8 @@ class Jobs(Queries):
     def hand_back(self, lease: Lease) -> bool:
         """Queue an executing job again, because its worker stops. The attempt does not count. Returns False if the lease
         is lost."""
-        return self._set(
+        return self._database.set(
+            JobRow,
             [*_held(lease), JobRow.cancel_requested.is_(False)],
             phase=Phase.QUEUED,
             attempt=JobRow.attempt - 1,
@@ -252,7 +255,7 @@ class Jobs(Queries):
         ahead = [JobRow.phase == Phase.EXECUTING, JobRow.heartbeat_at > now + lease_s]
         started_at = case((JobRow.started_at > now, now), else_=JobRow.started_at)
         self._note(ahead, heartbeat_at=now, started_at=started_at)
-        silent = [JobRow.phase == Phase.EXECUTING, JobRow.heartbeat_at < self._database.now - lease_s]
+        silent = [JobRow.phase == Phase.EXECUTING, JobRow.heartbeat_at < now - lease_s]
         too_often = and_(JobRow.cancel_requested.is_(False), JobRow.attempt >= max_attempts)
         error = JobError(
             fault=Fault.INTERNAL,
@@ -260,14 +263,11 @@ class Jobs(Queries):
             message=f"the worker was lost {max_attempts} times while it ran this job; the job is not tried again: tell "
             "the operator",
         )
-        ended = {
-            "phase": Phase.ERROR,
-            "ended_at": self._database.now,
-            "lease": None,
-            "error": error.model_dump(mode="json"),
-        }
         with self._database.writing.begin() as session:
-            lost = update(JobRow).where(*silent, too_often).values(**ended)
+            lost = update(JobRow).where(*silent, too_often)
+            lost = lost.values(
+                phase=Phase.ERROR, ended_at=now, lease=None, error=error.model_dump(mode="json")
+            )
             for job_id in session.scalars(lost.returning(JobRow.id)):
                 log.error("job %s: %s (%s)", job_id, error.message, error.code)
         with self._database.writing.begin() as session:
@@ -324,8 +324,7 @@ class Jobs(Queries):
             "attempt": 0,
             "cancel_requested": False,
         }
-        completed = (JobRow.id == job_id, JobRow.phase == Phase.COMPLETED)
-        return bool(self._database.change(update(JobRow).where(*completed).values(**again)))
+        return self._database.set(JobRow, [JobRow.id == job_id, JobRow.phase == Phase.COMPLETED], **again)
 
     def of_kind(self, kind: str) -> Sequence[JobRow]:
         """All jobs of a kind, in any phase. Use this only for kinds with few jobs."""
@@ -368,12 +367,8 @@ class Jobs(Queries):
         }
 
     def _note(self, conditions: Sequence[Any], **values: Any) -> bool:
-        """The same as ``_set`` for a change that streams of events do not report."""
-        return self._set(conditions, changed_at=JobRow.changed_at, **values)
-
-    def _set(self, conditions: Sequence[Any], **values: Any) -> bool:
-        """Run one UPDATE; returns whether it changed a row."""
-        return bool(self._database.change(update(JobRow).where(and_(*conditions)).values(**values)))
+        """Make a change that streams of events do not report. Returns whether it changed the job."""
+        return self._database.set(JobRow, conditions, changed_at=JobRow.changed_at, **values)
 
 
 def no_equal_at_work() -> ColumnElement[bool]:
@@ -401,21 +396,12 @@ def _held(lease: Lease) -> list[Any]:
     ]
 
 
-@dataclass(frozen=True)
-class Part:
-    """A worker's right to work on a part of a job.
-
-    A worker that has lost this right can still store its result, if no other worker has stored a result of the part.
-    """
-
-    owner: str
-    request_key: str
-    number: int
-    token: str
-
-
 class Parts(Queries):
-    """The table of parts."""
+    """The table of parts.
+
+    The row of a part that ``take`` returns is the right to work on it, as it was when it was taken. A worker that has lost
+    this right can still store its result, if no other worker has stored a result of the part.
+    """
 
     def open(self, owner: str, request_key: str, count: int) -> None:
         """Create the parts 0 to ``count`` - 1, except those that exist."""
@@ -424,53 +410,52 @@ class Parts(Queries):
             missing = [number for number in range(count) if number not in there]
             session.add_all(PartRow(owner=owner, request_key=request_key, number=one) for one in missing)
 
-    def take(self, owner: str, request_key: str, lease_s: float) -> Part | None:
+    def take(self, owner: str, request_key: str, lease_s: float) -> PartRow | None:
         """Take an open part, or a part whose worker has been silent for ``lease_s`` seconds; None if there is no such part."""
         # A heartbeat in the future was sent before the database's clock was set back; it counts as a heartbeat of now.
         now = self._database.now
         of_job = _of(owner, request_key)
-        self._set([*of_job, PartRow.heartbeat_at > now + lease_s], heartbeat_at=now)
+        self._database.set(PartRow, [*of_job, PartRow.heartbeat_at > now + lease_s], heartbeat_at=now)
         silent = PartRow.heartbeat_at < now - lease_s
         free = [*of_job, PartRow.result.is_(None), or_(PartRow.token.is_(None), silent)]
         lowest = select(PartRow.number).where(*free).order_by(PartRow.number)
         while (number := self._database.first(lowest)) is not None:
-            part = Part(owner, request_key, number, uuid.uuid4().hex)
-            if self._set([*free, PartRow.number == number], token=part.token, heartbeat_at=now):
+            part = PartRow(owner=owner, request_key=request_key, number=number, token=uuid.uuid4().hex)
+            if self._database.set(
+                PartRow, [*free, PartRow.number == number], token=part.token, heartbeat_at=now
+            ):
                 return part
         return None
 
-    def heartbeat(self, part: Part) -> bool:
+    def heartbeat(self, part: PartRow) -> bool:
         """Renew the lease. Returns False if another worker took the part or the part is done."""
-        return self._set(_holding(part), heartbeat_at=self._database.now)
+        return self._database.set(PartRow, _holding(part), heartbeat_at=self._database.now)
 
-    def finish(self, part: Part, result: dict[str, Any]) -> bool:
+    def finish(self, part: PartRow, result: dict[str, Any]) -> bool:
         """Store the result of a part. Returns False if the part already has a result.
 
         The first result is kept, even if the worker has lost the part, because every worker computes the same result.
         """
-        return self._set(_undone(part), result=result, token=None)
+        return self._database.set(PartRow, _undone(part), result=result, token=None)
 
-    def release(self, part: Part) -> None:
+    def release(self, part: PartRow) -> None:
         """Release a part without a result."""
-        self._set(_holding(part), token=None)
+        self._database.set(PartRow, _holding(part), token=None)
 
     def results(self, owner: str, request_key: str) -> list[dict[str, Any]]:
         """Results of the parts that are done, sorted by number."""
         done = select(PartRow.result).where(*_of(owner, request_key), PartRow.result.is_not(None))
         return [dict(one) for one in self._database.all(done.order_by(PartRow.number)) if one]
 
-    def _set(self, conditions: Sequence[Any], **values: Any) -> bool:
-        return bool(self._database.change(update(PartRow).where(and_(*conditions)).values(**values)))
-
 
 def _of(owner: str, request_key: str) -> list[ColumnElement[bool]]:
     return [PartRow.owner == owner, PartRow.request_key == request_key]
 
 
-def _undone(part: Part) -> list[Any]:
+def _undone(part: PartRow) -> list[Any]:
     this = [*_of(part.owner, part.request_key), PartRow.number == part.number]
     return [*this, PartRow.result.is_(None)]
 
 
-def _holding(part: Part) -> list[Any]:
+def _holding(part: PartRow) -> list[Any]:
     return [*_undone(part), PartRow.token == part.token]

@@ -23,7 +23,7 @@ from sqlalchemy import (
 from sqlalchemy.orm import DeclarativeBase, Mapped, MappedColumn, mapped_column
 
 from workers.catalogue.database import Now
-from workers.contract.jobs import LIVE, Queue
+from workers.contract.jobs import Queue
 
 DEFAULT_OWNER = "local"
 MOST_LETTERS = 1024  # longest path of a file of a bulk run
@@ -46,6 +46,7 @@ class Base(DeclarativeBase):
 
 _RELEASED = text("status IN ('certified', 'deprecated')")
 _DEPRECATED = text("status = 'deprecated'")
+_LIVE = text("phase IN ('COMPLETED', 'EXECUTING', 'QUEUED')")
 _EXECUTING = text("phase = 'EXECUTING'")
 _OPEN = text("phase IN ('ERROR', 'LISTING', 'PAUSED', 'RUNNING')")
 
@@ -75,7 +76,7 @@ def _change_time() -> MappedColumn[float]:
     return mapped_column(default=Now(), server_default="0", onupdate=later)
 
 
-class Owned:
+class OwnerColumns:
     """Columns of a thing of an owner."""
 
     owner: Mapped[str] = mapped_column(String(64), primary_key=True)
@@ -93,7 +94,27 @@ class Change:
     reason: Mapped[str] = mapped_column(String(400))
 
 
-class Uploaded(Owned):
+class FileColumns(OwnerColumns):
+    """Columns of a thing of an owner that has a file in the store."""
+
+    file_sha256: Mapped[str] = mapped_column(String(64))
+    bytes: Mapped[int] = mapped_column(BigInteger)
+
+
+class RunColumns:
+    """Columns of a job or of a bulk run."""
+
+    id: Mapped[str] = mapped_column(String(32), primary_key=True)
+    owner: Mapped[str] = mapped_column(String(64))
+    phase: Mapped[str] = mapped_column(String(16))
+    request_key: Mapped[str] = mapped_column(String(64))
+    created_at: Mapped[float]
+    ended_at: Mapped[float | None]
+    changed_at: Mapped[float] = _change_time()
+    error: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
+
+
+class UploadColumns(OwnerColumns):
     """Columns of an upload; its id is the SHA-256 of its bytes."""
 
     bytes: Mapped[int] = mapped_column(BigInteger)
@@ -101,21 +122,21 @@ class Uploaded(Owned):
     summary: Mapped[dict[str, Any]]
 
 
-class ImageRow(Uploaded, Base):
+class ImageRow(UploadColumns, Base):
     """An uploaded image."""
 
     __tablename__ = "images"
     __table_args__ = (_listed("images"), _summed("images"))
 
 
-class TransitRow(Uploaded, Base):
+class TransitRow(UploadColumns, Base):
     """An uploaded transit: the archive, unchanged."""
 
     __tablename__ = "transits"
     __table_args__ = (_listed("transits"), _summed("transits"))
 
 
-class PsfRow(Owned, Base):
+class PsfRow(FileColumns, Base):
     """An uploaded, built or fitted PSF. Its content never changes; a PSF with other content has another row.
 
     Before the PSF is certified, ``version`` is the version in the file. Afterwards it is the version in the series.
@@ -134,8 +155,6 @@ class PsfRow(Owned, Base):
     valid_to: Mapped[float | None]
     successor_id: Mapped[str | None] = mapped_column(String(64))
     origin: Mapped[str]  # built | fitted | uploaded
-    file_sha256: Mapped[str] = mapped_column(String(64))
-    bytes: Mapped[int] = mapped_column(BigInteger)
     preview_sha256: Mapped[str | None] = mapped_column(String(64))
     details: Mapped[dict[str, Any]]
 
@@ -192,7 +211,7 @@ class PsfChangeRow(Change, Base):
     __table_args__ = (Index("psf_changes_of_a_psf", "owner", "psf_id", "number"),)
 
 
-class PsfContextRow(Owned, Base):
+class PsfContextRow(OwnerColumns, Base):
     """A context: a named set of PSFs, with one PSF for each series and range of times.
 
     A context never changes. Its id is the hash of its name and of its pins.
@@ -237,7 +256,7 @@ class DefaultContextRow(Change, Base):
     __table_args__ = (Index("default_contexts_of_an_owner", "owner", "number"),)
 
 
-class ProductRow(Owned, Base):
+class ProductRow(FileColumns, Base):
     """A deconvolved image; its id is the identity of its request."""
 
     __tablename__ = "products"
@@ -245,8 +264,6 @@ class ProductRow(Owned, Base):
     image_id: Mapped[str] = mapped_column(String(64))
     psf_id: Mapped[str] = mapped_column(String(64))
     psf_version: Mapped[str]
-    file_sha256: Mapped[str] = mapped_column(String(64))
-    bytes: Mapped[int] = mapped_column(BigInteger)
     preview_sha256: Mapped[str] = mapped_column(String(64))
     details: Mapped[dict[str, Any]]
 
@@ -258,7 +275,7 @@ class ProductRow(Owned, Base):
     )
 
 
-class JobRow(Base):
+class JobRow(RunColumns, Base):
     """A job. ``work_key`` is the identity of its result.
 
     ``request_key`` normally equals ``work_key``. It is a different key if another queued, executing or completed job
@@ -266,18 +283,11 @@ class JobRow(Base):
     """
 
     __tablename__ = "jobs"
-    id: Mapped[str] = mapped_column(String(32), primary_key=True)
-    owner: Mapped[str] = mapped_column(String(64))
     kind: Mapped[str]
     parameters: Mapped[dict[str, Any]]
-    request_key: Mapped[str] = mapped_column(String(64))
     work_key: Mapped[str | None] = mapped_column(String(64))  # None while PENDING
-    phase: Mapped[str] = mapped_column(String(16))
     queue: Mapped[str] = mapped_column(String(16), default=Queue.INTERACTIVE, server_default="interactive")
-    created_at: Mapped[float] = mapped_column(index=True)
     started_at: Mapped[float | None]
-    ended_at: Mapped[float | None]
-    changed_at: Mapped[float] = _change_time()
     submitted_at: Mapped[float | None]
     submissions: Mapped[int] = mapped_column(default=0)
     # A temporary failure ended the last attempt, and the job has not been submitted again yet.
@@ -295,15 +305,15 @@ class JobRow(Base):
     count_at: Mapped[float | None]
     count_step: Mapped[int] = mapped_column(default=0, server_default="0")
     result_id: Mapped[str | None] = mapped_column(String(64))
-    error: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
     # The estimate was made when the job was submitted.
     estimate: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
 
     __table_args__ = (
         # If two identical requests arrive at the same moment, the second insert fails; the request then finds the first job.
-        _partial("one_live_job_a_request", phase.in_(sorted(LIVE)), "owner", "request_key", unique=True),
+        _partial("one_live_job_a_request", _LIVE, "owner", "request_key", unique=True),
         # If two jobs have the same result, the second cannot be claimed while the first executes.
         _partial("one_at_work_a_result", _EXECUTING, "owner", "work_key", unique=True),
+        Index("ix_jobs_created_at", "created_at"),
         Index("jobs_by_phase", "phase", "heartbeat_at", "submitted_at"),
         # This index contains the owner, so that the owners of many waiting jobs are found without reading the rows.
         Index("jobs_waiting", "phase", "queue", "created_at", "submitted_at", "owner"),
@@ -325,36 +335,28 @@ class TermsRow(Base):
     destruction_at: Mapped[float | None] = mapped_column(default=None, index=True)
 
 
-class BulkRow(Base):
+class BulkRow(RunColumns, Base):
     """A bulk run: many images that are deconvolved in the same way.
 
     A transaction that changes the items of the run also changes its counts.
     """
 
     __tablename__ = "bulks"
-    id: Mapped[str] = mapped_column(String(32), primary_key=True)
-    owner: Mapped[str] = mapped_column(String(64))
     name: Mapped[str] = mapped_column(String(80))
-    phase: Mapped[str] = mapped_column(String(16))
     request: Mapped[dict[str, Any]]  # without the ids of uploaded images; they are items of the run
-    request_key: Mapped[str] = mapped_column(String(64))
     psf_id: Mapped[str | None] = mapped_column(String(64))
     context_id: Mapped[str | None] = mapped_column(String(64))
-    created_at: Mapped[float]
     running_since: Mapped[float | None]
-    ended_at: Mapped[float | None]
-    changed_at: Mapped[float] = _change_time()
     listed: Mapped[bool]  # whether all files have been listed as items
     lister: Mapped[str | None] = mapped_column(
         String(32)
     )  # token of the lease of the worker that lists files
-    # how far the files are listed (``workers.bulk.listing.Place``); null: the listing has not begun, or it has no files
+    # how far the files are listed (``workers.bulk.listing.SearchPosition``); null: the listing has not begun, or it has no files
     listed_to: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
     total: Mapped[int] = mapped_column(default=0)
     done: Mapped[int] = mapped_column(default=0)
     reused: Mapped[int] = mapped_column(default=0)  # done images whose product existed before
     failed: Mapped[int] = mapped_column(default=0)
-    error: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
 
     __table_args__ = (
         _listed("bulks"),
@@ -408,15 +410,13 @@ class OwnerTurnRow(Base):
     number: Mapped[int] = mapped_column(BigInteger)
 
 
-class ReportRow(Owned, Base):
+class ReportRow(FileColumns, Base):
     """A report about a transit or about a rerun; its id is the identity of the request."""
 
     __tablename__ = "reports"
     kind: Mapped[str]
     transit_id: Mapped[str | None] = mapped_column(String(64))
     about_id: Mapped[str | None] = mapped_column(String(64))  # the PSF or product of a rerun
-    file_sha256: Mapped[str] = mapped_column(String(64))
-    bytes: Mapped[int] = mapped_column(BigInteger)
     preview_sha256: Mapped[str | None] = mapped_column(String(64))
     details: Mapped[dict[str, Any]]
 
@@ -428,15 +428,13 @@ class ReportRow(Owned, Base):
     )
 
 
-class SolutionRow(Owned, Base):
+class SolutionRow(FileColumns, Base):
     """The kept solution of a transit.
 
     The solution is removed when it is old or when its room is needed, because a job can make it again.
     """
 
     __tablename__ = "solutions"
-    file_sha256: Mapped[str] = mapped_column(String(64))
-    bytes: Mapped[int] = mapped_column(BigInteger)
 
 
 class PartRow(Base):

@@ -14,7 +14,7 @@ start first.
 
 from __future__ import annotations
 
-from sqlalchemy import ColumnElement, Select, and_, func, or_, select, update
+from sqlalchemy import ColumnElement, Select, and_, func, or_, select
 from sqlalchemy.orm import Session
 
 from workers.catalogue.database import Database, Queries
@@ -51,9 +51,7 @@ class Turns:
         # not submitted.
         blocked = [JobRow.phase == Phase.QUEUED, JobRow.queue == queue, ~no_equal_at_work()]
         received = JobRow.submitted_at.is_not(None)
-        self._database.change(
-            update(JobRow).where(*blocked, received).values(submitted_at=None, changed_at=JobRow.changed_at)
-        )
+        self._database.set(JobRow, [*blocked, received], submitted_at=None, changed_at=JobRow.changed_at)
         return None
 
     def leave_next(self, told_id: str, queue: Queue) -> str | None:

@@ -100,11 +100,6 @@ class Kind:
     memory_advice: str = "use fewer or smaller images"
     time_advice: str | None = None
 
-    @property
-    def request(self) -> type[Request]:
-        """The model of a request for this kind."""
-        return REQUESTS[self.name]
-
     def load_task(self) -> Task:
         """Import the task. Only workers may do this, because the task loads numerical libraries."""
         task: Task = load(self.task)

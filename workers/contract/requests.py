@@ -231,15 +231,11 @@ class Deconvolve(Treatment):
     )
 
     @model_validator(mode="after")
-    def _whole_for_errors(self) -> Deconvolve:
+    def _options_together(self) -> Deconvolve:
         if self.region is not None and self.error_draws:
             raise ValueError(region_without_errors(self.error_draws).message)
         if self.region is not None and self.method.stop == "discrepancy":
             raise ValueError(region_without_discrepancy().message)
-        return self
-
-    @model_validator(mode="after")
-    def _one_choice(self) -> Deconvolve:
         if self.psf_id is not None and self.context is not None:
             raise ValueError("expected psf_id, context or neither; got both: remove one")
         return self
@@ -408,28 +404,27 @@ class ResolvedDeconvolve(Deconvolve):
     context_id: str | None = None  # the context from which the service chose the PSF
 
 
-class ResolvedPsfFit(PsfFit):
-    """A fit with the recipe of the diffraction PSF, if the transit does not contain it."""
+class WithDiffraction(Parameters):
+    """A job on a transit: the recipe of the diffraction PSF, if the job needs this PSF and the transit does not contain it."""
 
     diffraction_recipe: PsfBuild | None = None
 
 
-class ResolvedCrossValidate(CrossValidate):
-    """A cross-validation with the recipe of the diffraction PSF, if the transit does not contain it."""
-
-    diffraction_recipe: PsfBuild | None = None
+class ResolvedPsfFit(WithDiffraction, PsfFit):
+    """A fit with the recipe of the diffraction PSF."""
 
 
-class ResolvedReport(Report):
-    """A report with the recipe of the diffraction PSF, if a fit needs one."""
-
-    diffraction_recipe: PsfBuild | None = None
+class ResolvedCrossValidate(WithDiffraction, CrossValidate):
+    """A cross-validation with the recipe of the diffraction PSF."""
 
 
-class ResolvedGapDiagnose(GapDiagnose):
+class ResolvedReport(WithDiffraction, Report):
+    """A report with the recipe of the diffraction PSF."""
+
+
+class ResolvedGapDiagnose(WithDiffraction, GapDiagnose):
     """A diagnosis with the recipe of the diffraction PSF and the effects that the operator adds to the library."""
 
-    diffraction_recipe: PsfBuild | None = None
     added_effects: tuple[str, ...] = ()
     # Hashes of the source texts of the added effects, because a changed text may change the diagnosis.
     added_effects_sha256: tuple[str, ...] = ()

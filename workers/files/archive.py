@@ -19,7 +19,7 @@ import shutil
 import stat
 import uuid
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePath
@@ -42,20 +42,20 @@ _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 _FILE = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _SIGNS = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge, "!=": operator.ne}
-Place = tuple[str, ...]
+Position = tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class Entry:
     """A folder or an entry of a folder at which a search looked.
 
-    place: the names of the folders below the fixed part of the pattern, and then the name of the entry; for a folder
+    position: the names of the folders below the fixed part of the pattern, and then the name of the entry; for a folder
     that is now read, the last name is empty. matches: whether the entry is a file that the pattern matches. error: the
     error if the entry could not be inspected.
     """
 
     path: Path
-    place: Place
+    position: Position
     matches: bool = False
     error: DataError | None = None
 
@@ -94,11 +94,11 @@ def check_glob(glob: str, allowed: Sequence[Path]) -> None:
     check_under(folder, allowed)
 
 
-def find(glob: str, allowed: Sequence[Path], after: Place | None = None) -> Iterator[Entry]:
+def find(glob: str, allowed: Sequence[Path], after: Position | None = None) -> Iterator[Entry]:
     """Find the files that a pattern matches, and yield every folder and entry at which the search looks, each once.
 
     The entries of a folder are sorted by name; those of its subfolders follow. Links that lead out of the allowed
-    folders are not followed. after: continue a search that ended after this place; what was added or removed before it
+    folders are not followed. after: continue a search that ended after this position; what was added or removed before it
     since then is not noticed. Raises DataError "bad-path", "path-not-allowed", "unreadable-folder".
     """
     folder, parts = _split(glob)
@@ -166,21 +166,23 @@ def _split(glob: str) -> tuple[Path, tuple[str, ...]]:
     return Path(*path.parts[:fixed]), tuple(parts)
 
 
-def _walk(top: Path, parts: tuple[str, ...], allowed: Sequence[Path], after: Place | None) -> Iterator[Entry]:
+def _walk(
+    top: Path, parts: tuple[str, ...], allowed: Sequence[Path], after: Position | None
+) -> Iterator[Entry]:
     """Read each folder only once, and compare its entries with all parts of the pattern that can match at this depth.
 
     Several ** in a pattern therefore cost no additional time.
     """
-    left = [(top, Place(), frozenset({0}))]
+    left = [(top, Position(), frozenset({0}))]
     while left:
         folder, names, indices = left.pop()
         if _is_after((*names, ""), after):
             yield Entry(folder, (*names, ""))
         # ** also matches no folder.
         indices |= {index + 1 for index in indices if parts[index] == ANY_FOLDERS}
-        below: list[tuple[Path, Place, frozenset[int]]] = []
+        below: list[tuple[Path, Position, frozenset[int]]] = []
         for entry in _entries(folder):
-            path, place = Path(entry.path), (*names, entry.name)
+            path, position = Path(entry.path), (*names, entry.name)
             meant, further, error = False, frozenset[int](), None
             try:
                 meant, further = _meant(entry, parts, indices, allowed)
@@ -189,21 +191,21 @@ def _walk(top: Path, parts: tuple[str, ...], allowed: Sequence[Path], after: Pla
                     f"expected a file or folder that can be inspected; the system says: {reason_of(failed)}"
                 )
                 error = DataError("unreadable-file", message)
-            if _is_after(place, after):
-                yield Entry(path, place, meant, error)
-            if further and _leads_after(place, after):
-                below.append((path, place, further))
+            if _is_after(position, after):
+                yield Entry(path, position, meant, error)
+            if further and _leads_after(position, after):
+                below.append((path, position, further))
         left += reversed(below)
 
 
-def _is_after(place: Place, after: Place | None) -> bool:
-    """Whether a search looks at a place later than at ``after``: folders come in the order of their names, and the
+def _is_after(position: Position, after: Position | None) -> bool:
+    """Whether a search looks at a position later than at ``after``: folders come in the order of their names, and the
     entries of a folder come before those of its subfolders."""
-    return after is None or (place[:-1], place[-1]) > (after[:-1], after[-1])
+    return after is None or (position[:-1], position[-1]) > (after[:-1], after[-1])
 
 
-def _leads_after(folder: Place, after: Place | None) -> bool:
-    """Whether the places in a folder and below it are after ``after``, or some of them are."""
+def _leads_after(folder: Position, after: Position | None) -> bool:
+    """Whether the positions in a folder and below it are after ``after``, or some of them are."""
     return after is None or folder >= after[:-1] or folder == after[: len(folder)]
 
 
@@ -376,15 +378,11 @@ def _folder(folder: Path, allowed: Sequence[Path], *, make: bool) -> Iterator[in
 
 
 def _make(name: str, folder: int) -> None:
-    try:
+    with suppress(FileExistsError):
         os.mkdir(name, dir_fd=folder)
         open_made_folder(name, folder)
-    except FileExistsError:
-        return
 
 
 def _remove(name: str, folder: int) -> None:
-    try:
+    with suppress(FileNotFoundError):
         os.unlink(name, dir_fd=folder)
-    except FileNotFoundError:
-        return

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -50,7 +50,7 @@ class Patience:
     pause_s: float
 
 
-# The calls of a worker must end long before ``collection.SETTLED_AFTER_S``: until then, a file that was moved aside can come back.
+# The calls of a worker must end long before ``garbage.SETTLED_AFTER_S``: until then, a file that was moved aside can come back.
 WORKER = Patience(silence_s=30.0, tries=3, pause_s=0.0)
 REQUEST = Patience(silence_s=10.0, tries=2, pause_s=5.0)
 
@@ -166,20 +166,16 @@ class RemoteStore(Store):
         for digit in "0123456789abcdef":
             with self._answering():
                 found = self._s3.find(f"{self._root}/blobs", prefix=digit, detail=True)
-            for name, about in sorted(found.items()):
-                yield Blob(name.rsplit("/", 1)[1], int(about["size"]), about["LastModified"].timestamp())
+            yield from (_blob_of(found[name]) for name in sorted(found))
 
     def remove(self, digest: str, kept_before: float) -> bool:
         """As ``Store.remove``. Raises ``StoreAway``.
 
         S3 cannot check and move a file in one step: a file that is stored in between is lost, but not its copy aside.
         """
-        if not self._is_old(digest, kept_before):
-            return False
-        if not self._copy(self._key(digest), self._key_aside(digest)):
-            return False
+        copied = self._is_old(digest, kept_before) and self._copy(self._key(digest), self._key_aside(digest))
         # Check again, because it takes long to copy a large file.
-        if not self._is_old(digest, kept_before):
+        if not copied or not self._is_old(digest, kept_before):
             return False
         with self._answering():
             self._s3.rm_file(self._key(digest))
@@ -191,8 +187,7 @@ class RemoteStore(Store):
         with self._answering():
             # With a prefix, s3fs does not take the folder for an object if a file is moved there just after an empty listing.
             found = self._s3.find(self._root, prefix="aside/", detail=True)
-        moved = {name: about["LastModified"].timestamp() for name, about in found.items()}
-        return {name.rsplit("/", 1)[1] for name, moved_at in moved.items() if moved_at < before}
+        return {blob.digest for blob in map(_blob_of, found.values()) if blob.kept_at < before}
 
     def bring_back(self, digest: str) -> bool:
         """As ``Store.bring_back``; the copy aside stays until ``delete_aside``. Raises ``StoreAway``."""
@@ -206,14 +201,10 @@ class RemoteStore(Store):
     def _about(self, digest: str) -> Blob | None:
         """Size and time of a file; None if it is absent. Raises ``StoreAway``."""
         bucket, _, name = self._key(digest).partition("/")
-        with self._answering():
-            try:
-                head = self._s3.call_s3("head_object", Bucket=bucket, Key=name)
-            except FileNotFoundError:
-                head = None
-        if head is None:
-            return self._listed(self._key(digest))
-        return Blob(digest, int(head["ContentLength"]), head["LastModified"].timestamp())
+        with self._answering(), suppress(FileNotFoundError):
+            head = self._s3.call_s3("head_object", Bucket=bucket, Key=name)
+            return Blob(digest, int(head["ContentLength"]), head["LastModified"].timestamp())
+        return self._listed(self._key(digest))
 
     def _copy(self, source: str, target: str) -> bool:
         """Copy an object within the bucket; returns False if the source is absent."""
@@ -229,10 +220,7 @@ class RemoteStore(Store):
         bucket, _, name = key.partition("/")
         with self._answering():
             listed = self._s3.call_s3("list_objects_v2", Bucket=bucket, Prefix=name, MaxKeys=1)
-        for one in listed.get("Contents", ()):
-            if one["Key"] == name:
-                return Blob(name.rsplit("/", 1)[1], int(one["Size"]), one["LastModified"].timestamp())
-        return None
+        return next((_blob_of(one) for one in listed.get("Contents", ()) if one["Key"] == name), None)
 
     @contextmanager
     def _answering(self, key: str | None = None) -> Iterator[None]:
@@ -310,3 +298,8 @@ class RemoteStore(Store):
                 return
             path.unlink(missing_ok=True)
             total -= size
+
+
+def _blob_of(entry: Mapping[str, Any]) -> Blob:
+    """The file of an entry of a listing of the bucket."""
+    return Blob(entry["Key"].rsplit("/", 1)[1], int(entry["Size"]), entry["LastModified"].timestamp())

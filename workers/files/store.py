@@ -5,7 +5,7 @@ File names are hashes; they never come from a client.
 
 A file is removed in two steps, because an upload or a job stores its file before it adds the row that names the file.
 ``remove`` moves the file aside. From there ``path`` brings it back as soon as something needs it. Later
-``workers.files.collection.settle`` reads the rows: it brings back the files that a row names, and deletes the others.
+``workers.files.garbage.settle`` reads the rows: it brings back the files that a row names, and deletes the others.
 """
 
 from __future__ import annotations

@@ -83,7 +83,7 @@ class SearchResult:
     def _why_none(self) -> str:
         given = self._given()
         before = dict(list(given.items())[: list(given).index(self.emptied_by)]) if self.emptied_by else given
-        asked = f"{self.emptied_by} {given[self.emptied_by]}" if self.emptied_by else "any property"
+        missing = f"{self.emptied_by} {given[self.emptied_by]}" if self.emptied_by else "any property"
         among = f"no PSF with {_joined(before)}" if before else "no PSF"
         between = ""
         if self.ends is not None:
@@ -91,7 +91,7 @@ class SearchResult:
                 f"; a deconvolution of the image interpolates between PSF {self.ends.before_psf_id} and PSF "
                 f"{self.ends.after_psf_id}"
             )
-        return f"expected one PSF with {self._said()}; {among} has {asked}{between}"
+        return f"expected one PSF with {self._said()}; {among} has {missing}{between}"
 
     def _said(self) -> str:
         return _joined(self._given()) or "no filter"
@@ -120,7 +120,7 @@ def look(catalogue: Catalogue, wanted: PsfFilter, owner: str, context: str | Non
 
     Raises ``DataError`` "no-such-context".
     """
-    return _look(catalogue, wanted, owner, catalogue.contexts.asked_for(context, owner))
+    return _look(catalogue, wanted, owner, catalogue.contexts.for_request(context, owner))
 
 
 def _look(catalogue: Catalogue, wanted: PsfFilter, owner: str, pinned: PsfContextRow | None) -> SearchResult:
@@ -140,7 +140,7 @@ def look_for_image(
     If the channel has variants, the filter and the plate scale in the header choose the variant.
     Raises ``DataError`` "no-instrument", "no-date", "no-such-context" or "several-variants-fit".
     """
-    pinned = catalogue.contexts.asked_for(context, owner)
+    pinned = catalogue.contexts.for_request(context, owner)
     instrument, channel = _seen_as(catalogue, header, owner, pinned, kind)
     if instrument is None:
         raise DataError(
@@ -184,7 +184,7 @@ def picked_for_image(
 
     Raises the same ``DataError`` as ``look_for_image``, and "no-psf-fits" if the series has PSFs, but the context contains none of them.
     """
-    pinned = catalogue.contexts.asked_for(context, owner)
+    pinned = catalogue.contexts.for_request(context, owner)
     instrument, channel = _seen_as(catalogue, header, owner, pinned, TOTAL)
     series = series_of(instrument, channel, TOTAL)
     wanted = PsfFilter(instrument, channel, TOTAL)
@@ -252,12 +252,12 @@ def reasoned_psf(
         assert before is not None  # resolve() has found it
         name, version = interpolated_name(before.instrument, resolved.psf_id)
         why = _why_interpolated(resolved.psf_interpolation, catalogue, owner) + "; the job makes it first."
-        return ChosenPsf(id=resolved.psf_id, name=name, version=version, status=None, why=why)
-    # resolve() has found the image and the PSF, or the recipe of the PSF
-    assert resolved.psf_recipe is not None and resolved.psf_recipe.instrument is not None
-    instrument = load_instrument(resolved.psf_recipe.instrument)
-    name, version = instrument.name, instrument.version
-    why = _why_built(wanted, catalogue, owner) + "; the job builds it first."
+    else:
+        # resolve() has found the image and the PSF, or the recipe of the PSF
+        assert resolved.psf_recipe is not None and resolved.psf_recipe.instrument is not None
+        instrument = load_instrument(resolved.psf_recipe.instrument)
+        name, version = instrument.name, instrument.version
+        why = _why_built(wanted, catalogue, owner) + "; the job builds it first."
     return ChosenPsf(id=resolved.psf_id, name=name, version=version, status=None, why=why)
 
 
@@ -277,15 +277,15 @@ def _why(
     return f"{which} {catalogue.contexts.named(resolved.context_id, owner).name} pins this PSF for {seen}."
 
 
-def _why_interpolated(asked: PsfInterpolate, catalogue: Catalogue, owner: str) -> str:
+def _why_interpolated(interpolation: PsfInterpolate, catalogue: Catalogue, owner: str) -> str:
     said = []
-    for psf_id, until in ((asked.before_psf_id, "until"), (asked.after_psf_id, "from")):
+    for psf_id, until in ((interpolation.before_psf_id, "until"), (interpolation.after_psf_id, "from")):
         row = catalogue.get(PsfRow, psf_id, owner)
         named = psf_id[:12] if row is None else f"{psf_id[:12]} ({row.name} {row.version})"
         said.append(
-            f"PSF {named}, which holds {until} {asked.before_time if until == 'until' else asked.after_time}"
+            f"PSF {named}, which holds {until} {interpolation.before_time if until == 'until' else interpolation.after_time}"
         )
-    return f"This PSF is interpolated to {asked.time}, between {said[0]}, and {said[1]}"
+    return f"This PSF is interpolated to {interpolation.time}, between {said[0]}, and {said[1]}"
 
 
 def _why_built(wanted: Deconvolve, catalogue: Catalogue, owner: str) -> str:

@@ -24,12 +24,18 @@ from workers.contract.identities import (
     psf_identity,
 )
 from workers.contract.kinds import KINDS, JobRequest, Kind, load
-from workers.contract.requests import Deconvolve, Parameters, PsfBuild, ResolvedDeconvolve
+from workers.contract.requests import (
+    Deconvolve,
+    Parameters,
+    PsfBuild,
+    ResolvedDeconvolve,
+    WithDiffraction,
+)
 from workers.intake import compatibility
 from workers.intake.compatibility import check_not_deprecated
 from workers.intake.psf_choice import SearchResult, no_psf, picked_for_image
 from workers.lineage import made_by
-from workers.rows import row_of
+from workers.lookup import row_of
 
 
 @dataclass(frozen=True)
@@ -73,64 +79,66 @@ def resolve(
     return resolved.model_dump(mode="json"), identity
 
 
-def resolve_by_ids(asked: Submission) -> Parameters:
+def resolve_by_ids(submission: Submission) -> Parameters:
     """Check the ids in the parameters, and add the recipe of the diffraction PSF if the kind needs one.
 
     A parameter is an id if its name is ``image_id``, ``psf_id`` or ``transit_id``, or ends in ``_image_id``, ``_psf_id`` or
     ``_transit_id``.
     """
-    parameters = asked.parameters
+    parameters = submission.parameters
     for name, identity in parameters:
         for of, table in _TABLES.items():
             if identity is not None and f"_{name}".endswith(f"_{of}_id"):
-                asked.row(table, identity)
-    assert asked.kind.resolved is not None
-    if "diffraction_recipe" not in asked.kind.resolved.model_fields:
-        return asked.resolved()
-    summary = asked.row(TransitRow, parameters.transit_id).summary
-    return asked.resolved(diffraction_recipe=_diffraction_of(asked, summary))
+                submission.row(table, identity)
+    assert submission.kind.resolved is not None
+    if not issubclass(submission.kind.resolved, WithDiffraction):
+        return submission.resolved()
+    summary = submission.row(TransitRow, parameters.transit_id).summary
+    return submission.resolved(diffraction_recipe=_diffraction_of(submission, summary))
 
 
-def resolve_psf_build(asked: Submission) -> Parameters:
+def resolve_psf_build(submission: Submission) -> Parameters:
     """Check the instrument file and the mask of a PSF build."""
-    build: PsfBuild = asked.parameters
+    build: PsfBuild = submission.parameters
     label = build.instrument or "instrument_file"
     check_workload(parse_instrument(instrument_text(build), label), label)
     if build.mask_id is not None:
-        asked.row(ImageRow, build.mask_id)
+        submission.row(ImageRow, build.mask_id)
     return build
 
 
-def resolve_report(asked: Submission) -> Parameters:
+def resolve_report(submission: Submission) -> Parameters:
     """Resolve a report. A report on a given PSF needs no fit, and therefore no diffraction PSF and no dark offsets."""
-    if asked.parameters.psf_id is None:
-        return resolve_by_ids(asked)
-    summary = asked.row(TransitRow, asked.parameters.transit_id).summary
-    asked.row(PsfRow, asked.parameters.psf_id)
-    check_noise(summary, asked.parameters.noise)
+    if submission.parameters.psf_id is None:
+        return resolve_by_ids(submission)
+    summary = submission.row(TransitRow, submission.parameters.transit_id).summary
+    submission.row(PsfRow, submission.parameters.psf_id)
+    check_noise(summary, submission.parameters.noise)
     # The ignored parameter is set to a fixed value, so that requests that differ only in it share one report.
-    return asked.resolved(dark_offsets=False)
+    return submission.resolved(dark_offsets=False)
 
 
-def resolve_gap_diagnose(asked: Submission) -> Parameters:
+def resolve_gap_diagnose(submission: Submission) -> Parameters:
     """Resolve a diagnosis: also record the effects that the operator adds, and the SHA-256 of their source texts."""
-    added = asked.added_effects
+    added = submission.added_effects
     fields = {"added_effects": added, "added_effects_sha256": tuple(map(sha256_of_source, added))}
-    resolved = resolve_by_ids(asked)
+    resolved = resolve_by_ids(submission)
     return resolved.model_validate(resolved.model_dump(mode="json") | fields)
 
 
-def resolve_rerun(asked: Submission) -> Parameters:
+def resolve_rerun(submission: Submission) -> Parameters:
     """Resolve a rerun: find the job that made the product or PSF."""
-    again = asked.parameters
-    row = asked.row(PsfRow, again.id) if again.of == "psf" else asked.row(ProductRow, again.id)
-    return made_by(asked.catalogue, row)
+    again = submission.parameters
+    row = submission.row(PsfRow, again.id) if again.of == "psf" else submission.row(ProductRow, again.id)
+    return made_by(submission.catalogue, row)
 
 
-def resolve_deconvolve(asked: Submission) -> Parameters:
+def resolve_deconvolve(submission: Submission) -> Parameters:
     """Resolve a deconvolution: also choose its PSF."""
-    image = asked.row(ImageRow, asked.parameters.image_id)
-    return resolved_deconvolution(asked.parameters, image.summary, asked.catalogue, asked.owner)
+    image = submission.row(ImageRow, submission.parameters.image_id)
+    return resolved_deconvolution(
+        submission.parameters, image.summary, submission.catalogue, submission.owner
+    )
 
 
 def resolved_deconvolution(
@@ -153,15 +161,15 @@ def resolved_deconvolution(
 _TABLES: dict[str, Any] = {"image": ImageRow, "psf": PsfRow, "transit": TransitRow}
 
 
-def _diffraction_of(asked: Submission, summary: dict[str, Any]) -> PsfBuild | None:
+def _diffraction_of(submission: Submission, summary: dict[str, Any]) -> PsfBuild | None:
     """The recipe of the diffraction PSF of a transit; None if the transit contains this PSF."""
-    recipe = diffraction_build(summary, asked.parameters.noise)
+    recipe = diffraction_build(summary, submission.parameters.noise)
     if recipe is None:
         return None
     check_not_deprecated(
-        asked.catalogue,
+        submission.catalogue,
         psf_identity(recipe),
-        asked.owner,
+        submission.owner,
         f"the diffraction PSF that heliopsf builds for {recipe.instrument}",
         "name the file of another diffraction PSF as known_psf in transit.json; to use the deprecated PSF anyway, write it "
         "to a file with `heliopsf psf download {psf} -o FILE` and name that file as known_psf",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextvars
 import logging
-import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -17,6 +16,7 @@ from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
 from workers.contract.jobs import Fault, JobError, Phase
 from workers.run.child import Child, Stopping
+from workers.settings import Settings
 from workers.stage_timer import StageTimer
 
 log = logging.getLogger(__name__)
@@ -45,7 +45,7 @@ class Cancelled(Exception):
 
 @dataclass
 class Attempt:
-    """A claimed job while it runs. The first report of progress later than ``limit_s`` after ``started`` stops the job.
+    """A claimed job while it runs. The first report of progress later than ``max_job_s`` after ``started`` stops the job.
 
     child: this process; None if it must not be ended. The process is ended if the job must stop but still runs
     ``cancel_s`` later, or if the thread of the heartbeats cannot run for ``silent_s``.
@@ -53,12 +53,9 @@ class Attempt:
 
     catalogue: Catalogue
     lease: Lease
-    heartbeat_s: float
+    settings: Settings
     stopping: Stopping
-    limit_s: float
     child: Child | None = None
-    cancel_s: float = math.inf
-    silent_s: float = math.inf
     started: float = field(default_factory=time.monotonic)
     stopped: threading.Event = field(default_factory=threading.Event)
     ended: threading.Event = field(default_factory=threading.Event)
@@ -72,7 +69,7 @@ class Attempt:
         run = contextvars.copy_context().run
         name = f"heartbeat {self.lease.job_id}"
         if self.child is not None:
-            self.child.expect_news_within(self.silent_s)
+            self.child.expect_news_within(self.settings.silent_s)
         heart = threading.Thread(target=run, args=(self._beat,), name=name, daemon=True)
         heart.start()
         try:
@@ -85,36 +82,34 @@ class Attempt:
 
     def _beat(self) -> None:
         """Send heartbeats until the attempt ends or is cancelled. If the worker must stop, hand the job back."""
-        while not self.ended.wait(self.heartbeat_s):
+        while not self.ended.wait(self.settings.heartbeat_s):
             try:
                 if self.child is not None:
-                    self.child.expect_news_within(self.silent_s)
+                    self.child.expect_news_within(self.settings.silent_s)
                 if self.stopping.due and self.catalogue.jobs.hand_back(self.lease):
                     log.warning("job %s: handed back because this worker is stopping", self.lease.job_id)
                     self.stopped.set()
                     return
                 alive = self.catalogue.jobs.heartbeat(self.lease)
-            except SQLAlchemyError as error:
-                # Try again at the next heartbeat. If the database stays away, the lease expires and another worker gets the job.
-                log.warning("job %s: could not write the heartbeat: %s", self.lease.job_id, error)
-                continue
-            except MemoryError as error:
-                # The job has reached its memory limit. Its task gets the error. The next heartbeat may have memory
-                # again.
-                log.warning("job %s: no memory for the heartbeat: %s", self.lease.job_id, error)
+            except (SQLAlchemyError, MemoryError) as error:
+                # Try again at the next heartbeat. If the database stays away, the lease expires and another worker gets the
+                # job. MemoryError: the job has reached its memory limit, and its task gets the error too.
+                log.warning("job %s: could not write the heartbeat: %r", self.lease.job_id, error)
                 continue
             if not alive:
                 self.stopped.set()
                 self._end_if_deaf()
                 return
-            if time.monotonic() - self.started > self.limit_s + self.cancel_s:
+            if time.monotonic() - self.started > self.settings.max_job_s + self.settings.cancel_s:
                 self._give_up(
-                    lambda: self.catalogue.jobs.fail(self.lease, TookTooLong(self.limit_s).as_error())
+                    lambda: self.catalogue.jobs.fail(
+                        self.lease, TookTooLong(self.settings.max_job_s).as_error()
+                    )
                 )
 
     def _end_if_deaf(self) -> None:
         """Wait until the task has stopped. If it does not stop within ``cancel_s``, end the process."""
-        if self.child is not None and not self.ended.wait(self.cancel_s):
+        if self.child is not None and not self.ended.wait(self.settings.cancel_s):
             self._give_up(lambda: self.catalogue.jobs.abort(self.lease))
 
     def _give_up(self, record: Callable[[], bool]) -> None:
@@ -152,8 +147,8 @@ class Attempt:
                 log.warning("job %s: could not write the progress: %s", self.lease.job_id, error)
         if self.stopped.is_set():
             raise Cancelled(self.lease.job_id)
-        if time.monotonic() - self.started > self.limit_s:
-            raise TookTooLong(self.limit_s)
+        if time.monotonic() - self.started > self.settings.max_job_s:
+            raise TookTooLong(self.settings.max_job_s)
 
 
 @dataclass

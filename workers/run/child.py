@@ -17,10 +17,13 @@ import errno
 import faulthandler
 import logging
 import os
+import socket
 import sys
 import time
+import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from multiprocessing.sharedctypes import RawValue
 from pathlib import Path
 
@@ -130,6 +133,17 @@ class Idle:
         """The time since which there is nothing to do, s; 0 if there is work, or if it is not known."""
         since = self._since.value
         return time.monotonic() - since if since else 0.0
+
+
+def worker_name() -> str:
+    """The name of this process, as jobs and the list of workers show it."""
+    return _name(os.getpid())
+
+
+@cache
+def _name(process: int) -> str:
+    """A name that no other process has: workers in different containers may have the same host name and process id."""
+    return f"{socket.gethostname()}:{process}:{uuid.uuid4().hex[:8]}"
 
 
 def allowed_mib(estimate_mib: int) -> int:

@@ -4,13 +4,9 @@ exception into the error of a job."""
 from __future__ import annotations
 
 import logging
-import os
-import socket
 import time
-import uuid
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from functools import cache
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from importlib import import_module
 from typing import Any
 
@@ -21,13 +17,14 @@ from workers import logs, traces
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.database import is_away
 from workers.catalogue.jobs import Lease
-from workers.catalogue.owners import NOT_KEPT
-from workers.catalogue.tables import JobRow, ProductRow, PsfRow, ReportRow
+from workers.catalogue.quotas import NOT_KEPT
+from workers.catalogue.tables import JobRow
 from workers.contract.jobs import Fault, JobError, Phase, Queue
 from workers.contract.kinds import KINDS
 from workers.files.store import NO_ROOM, STORAGE_FULL, Store, is_disk_full
+from workers.intake.repair import TABLES
 from workers.run.attempt import Assistance, Attempt, Cancelled, TookTooLong
-from workers.run.child import MARGIN, Child, Stopping, allowed_mib, is_out_of_memory
+from workers.run.child import MARGIN, Child, Stopping, allowed_mib, is_out_of_memory, worker_name
 from workers.settings import Settings
 from workers.stage_timer import StageTimer
 from workers.tasks.catalogue_workspace import CatalogueWorkspace
@@ -50,17 +47,6 @@ def load_tasks() -> None:
         kind.load_task()
     for name in LATE:
         import_module(name)
-
-
-def worker_name() -> str:
-    """The name of this process, as jobs and the list of workers show it."""
-    return _name(os.getpid())
-
-
-@cache
-def _name(process: int) -> str:
-    """A name that no other process has: workers in different containers may have the same host name and process id."""
-    return f"{socket.gethostname()}:{process}:{uuid.uuid4().hex[:8]}"
 
 
 class Runner:
@@ -108,17 +94,7 @@ class Runner:
             return
         with logs.bound(job=job.id, owner=job.owner), traces.of_job(job.id, job.kind):
             log.info("job %s: %s starts, attempt %d", job.id, job.kind, job.attempt)
-            settings = self._settings
-            attempt = Attempt(
-                self._catalogue,
-                lease,
-                settings.heartbeat_s,
-                self._stopping,
-                settings.max_job_s,
-                child=self._child,
-                cancel_s=settings.cancel_s,
-                silent_s=settings.silent_s,
-            )
+            attempt = Attempt(self._catalogue, lease, self._settings, self._stopping, self._child)
             try:
                 with attempt.beating(), listening(attempt.compiling):
                     self._attempt(job, lease, attempt)
@@ -198,20 +174,15 @@ class Runner:
         The quota was checked when the job was submitted, but other jobs may have filled it since then. A result that
         already exists needs no room.
         """
-        if not KINDS[job.kind].needs_room:
+        kind = KINDS[job.kind]
+        if not kind.needs_room:
             return
-        usage = self._catalogue.owners.limited(job.owner, self._settings.quota_mib)
-        if usage is not None and usage.full and not self._is_there(job):
+        usage = self._catalogue.quotas.limited(job.owner, self._settings.quota_mib)
+        if usage is None or not usage.full:
+            return
+        # An identical job, or an earlier attempt that could not record its end, may have made the result.
+        if not self._catalogue.ids_among(TABLES[kind.result], [job.work_key or ""], job.owner):
             raise DataError("quota-exceeded", usage.no_room(NOT_KEPT))
-
-    def _is_there(self, job: JobRow) -> bool:
-        """Whether the result already exists.
-
-        An identical job, or an earlier attempt that could not record its end, may have made it.
-        """
-        made, find = job.work_key, self._catalogue.get
-        tables: tuple[type[Any], ...] = (ProductRow, PsfRow, ReportRow)
-        return made is not None and any(find(table, made, job.owner) is not None for table in tables)
 
     def _keep_times(self, job: JobRow, times: StageTimer) -> None:
         """Add the stage times of an attempt to the sums. The outcome of the attempt is already recorded, so a failure here is only logged."""
@@ -240,14 +211,9 @@ class Runner:
             return self._error_of(job, error)
         return None
 
-    @contextmanager
-    def _limited(self, job: JobRow) -> Iterator[None]:
+    def _limited(self, job: JobRow) -> AbstractContextManager[None]:
         """Limit the memory of the block to the estimate of the job, if this process may be limited."""
-        if self._child is None:
-            yield
-            return
-        with self._child.limited(self._estimate_mib(job)):
-            yield
+        return nullcontext() if self._child is None else self._child.limited(self._estimate_mib(job))
 
     def _estimate_mib(self, job: JobRow) -> int:
         """The memory for which the job was admitted, MiB. Without an estimate, it is the operator's limit."""

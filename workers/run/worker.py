@@ -21,16 +21,20 @@ from typing import TYPE_CHECKING
 from celery import Task
 from celery.signals import setup_logging, worker_init, worker_process_init, worker_shutting_down
 from celery.worker import state
+from sqlalchemy.exc import SQLAlchemyError
 
-from workers import logs, traces
+from workers import checks, logs, traces
 from workers.broker import app as queue
 from workers.broker.order import TakeWhatCanStart
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.database import is_away
+from workers.catalogue.schema import SchemaError
 from workers.contract.jobs import broker_name, queue_of_broker
-from workers.run.child import Child, Idle, Stopping
+from workers.files.store import open_store
+from workers.run.child import Child, Idle, Stopping, worker_name
 from workers.settings import Settings, software_version
 
 if TYPE_CHECKING:
-    from workers.catalogue.catalogue import Catalogue
     from workers.run.runner import Runner
 
 log = logging.getLogger(__name__)
@@ -71,10 +75,6 @@ def _waiting_for_the_database(job_id: str) -> Iterator[None]:
 
     The row of the job says what to do: it is submitted again, at once or when its lease has expired.
     """
-    from sqlalchemy.exc import SQLAlchemyError
-
-    from workers.catalogue.database import is_away
-
     try:
         yield
     except SQLAlchemyError as error:
@@ -91,11 +91,6 @@ def _logs(**_: object) -> None:
 
 @worker_init.connect
 def _watch(**_: object) -> None:
-    from sqlalchemy.exc import SQLAlchemyError
-
-    from workers import checks
-    from workers.catalogue.schema import SchemaError
-
     try:
         check_tables()
     # Celery would log an Exception and continue; SystemExit ends the worker.
@@ -116,12 +111,6 @@ def check_tables() -> None:
 
     Raises ``workers.catalogue.schema.SchemaError`` if this version of the software needs another revision.
     """
-    from sqlalchemy.exc import SQLAlchemyError
-
-    from workers import checks
-    from workers.catalogue.catalogue import Catalogue
-    from workers.catalogue.database import is_away
-
     catalogue = Catalogue(
         settings.catalogue_url
     )  # closed below, because no connection may be open when the process forks
@@ -161,10 +150,6 @@ def _prepare_child(**_: object) -> None:
 
 def _look_for_jobs(within_s: float) -> None:
     """Tell the parent whether there is a job to do. A database that does not answer may have one."""
-    from sqlalchemy.exc import SQLAlchemyError
-
-    from workers.run.runner import worker_name
-
     while not stopping.asked:
         try:
             work = _catalogue().jobs.any_to_do(settings.queues, settings.lease_s, worker_name())
@@ -193,10 +178,6 @@ def _end_when_idle(after_s: float) -> None:
 
 def _be_present() -> None:
     """Announce this child in the list of workers at regular intervals; remove it when the worker stops."""
-    from sqlalchemy.exc import SQLAlchemyError
-
-    from workers.run.runner import worker_name
-
     started_at = time.time()
     while True:
         leaving = stopping.asked
@@ -222,7 +203,6 @@ def _runner() -> Runner:
     # Set this before numba is imported, because numba's OpenMP layer ends forked child processes.
     os.environ["NUMBA_THREADING_LAYER"] = "workqueue"
     os.environ["NUMBA_NUM_THREADS"] = str(settings.threads)
-    from workers.files.store import open_store
     from workers.run.runner import Runner, load_tasks
 
     load_tasks()
@@ -239,8 +219,6 @@ def _runner() -> Runner:
 
 @lru_cache(maxsize=1)
 def _catalogue() -> Catalogue:
-    from workers.catalogue.catalogue import Catalogue
-
     return Catalogue(settings.catalogue_url)
 
 

@@ -13,18 +13,18 @@ from typing import TYPE_CHECKING, Any
 
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits
-from workers.catalogue.catalogue import Catalogue, Made, Row
-from workers.catalogue.jobs import Lease, Part
-from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, ReportRow, TransitRow
+from workers.catalogue.catalogue import AnyResult, Catalogue, Row
+from workers.catalogue.jobs import Lease
+from workers.catalogue.tables import ImageRow, PartRow, ProductRow, PsfRow, ReportRow, TransitRow
 from workers.contract.identities import interpolated_psf_identity
 from workers.contract.jobs import JobError
 from workers.contract.kinds import KINDS, ResultType
 from workers.contract.requests import PsfBuild, ResolvedDeconvolve, ResolvedOnTransit
-from workers.files.collection import intact
+from workers.files.garbage import ENTRIES, intact, intact_row
 from workers.files.store import Store
-from workers.intake.again import TABLES, there
 from workers.intake.compatibility import DEPRECATED_CODE, deprecated_warning, of_upload
-from workers.rows import row_of
+from workers.intake.repair import TABLES
+from workers.lookup import row_of
 from workers.settings import Settings
 from workers.stage_timer import StageTimer
 from workers.tasks.workspace import PARTS, Json, Progress, Result, Workspace
@@ -38,15 +38,6 @@ if TYPE_CHECKING:
     from psfcore.scatter.inversion import Inverter
 
 ResultRow = ProductRow | PsfRow | ReportRow
-# The entries of a row's details that name the further files of a result, by the names of the files.
-ENTRIES = {
-    "tables": "tables_sha256",
-    "report": "report_sha256",
-    "html": "page_sha256",
-    "texts": "page_texts_sha256",
-    "changes": "changes_picture_sha256",
-    "thumbnail": "thumbnail_sha256",
-}
 WAIT_S = 0.5
 MOST_HELPERS = 16
 
@@ -84,7 +75,7 @@ class CatalogueWorkspace(Workspace):
 
     @property
     def limits(self) -> FitsLimits:
-        return FitsLimits(max_pixels=self.settings.max_pixels)
+        return self.settings.image_limits
 
     # Inputs -------------------------------------------------------------------------------------------
 
@@ -190,13 +181,12 @@ class CatalogueWorkspace(Workspace):
 
     # Results ------------------------------------------------------------------------------------------
 
-    def made(self, table: type[Made], identity: str) -> Made | None:
+    def made(self, table: type[AnyResult], identity: str) -> AnyResult | None:
         """The row of the result of an earlier job; None if there is none or if one of its files is lost."""
-        row = self.catalogue.get(table, identity, self.owner)
-        return row if row is not None and intact(self.store, row) else None
+        return intact_row(self.catalogue, self.store, table, identity, self.owner)
 
     def has(self, result: ResultType, identity: str) -> bool:
-        return there(result, identity, self.owner, self.catalogue, self.store)
+        return self.made(TABLES[result], identity) is not None
 
     def add(self, result: Result) -> None:
         self.keep(result)
@@ -286,10 +276,12 @@ class CatalogueWorkspace(Workspace):
         while (part := self._part(identity)) is not None:
             self._compute(part, compute, 0, count)
 
-    def _part(self, identity: str) -> Part | None:
+    def _part(self, identity: str) -> PartRow | None:
         return self.catalogue.parts.take(self.owner, identity, self.settings.lease_s)
 
-    def _compute(self, part: Part, compute: Callable[[int, Progress], Json], done: int, count: int) -> None:
+    def _compute(
+        self, part: PartRow, compute: Callable[[int, Progress], Json], done: int, count: int
+    ) -> None:
         """Compute one part, and renew its lease meanwhile. After an exception the part is released for another worker."""
         last = time.monotonic()
 

@@ -29,11 +29,10 @@ from psfcore.scatter.validation.cross_validation import (
     shared_fits,
 )
 from workers.contract.identities import psf_fit_identity
-from workers.contract.kinds import ResultType
 from workers.contract.requests import ResolvedCrossValidate
 from workers.tasks.results import provenance_of, report_result
 from workers.tasks.transits import load_transit
-from workers.tasks.workspace import Json, Progress, Workspace
+from workers.tasks.workspace import Json, Progress, Workspace, task_of
 
 if TYPE_CHECKING:
     from workers.tasks.catalogue_workspace import CatalogueWorkspace
@@ -42,12 +41,9 @@ Samples = tuple[FoldSample, ...]
 _PLOT = "psfcore.scatter.plots"
 
 
-def cross_validate(workspace: Workspace, parameters: Mapping[str, Any]) -> str:
-    """Cross-validate the fit of a transit; returns the report's id."""
-    request = ResolvedCrossValidate.model_validate(parameters)
-    identity = psf_fit_identity(request)
-    if workspace.has(ResultType.REPORT, identity):
-        return identity
+@task_of("cross-validate")
+def cross_validate(workspace: Workspace, request: ResolvedCrossValidate, identity: str) -> None:
+    """Cross-validate the fit of a transit, and add the report."""
     solution, samples = _solution(workspace, request)
     if request.scheme == "shared":
         fits = shared_fits(solution, samples, progress=workspace.report)
@@ -79,7 +75,6 @@ def cross_validate(workspace: Workspace, parameters: Mapping[str, Any]) -> str:
             transit_id=request.transit_id,
         )
     )
-    return identity
 
 
 def assist_cross_validation(workspace: CatalogueWorkspace, parameters: Mapping[str, Any]) -> None:

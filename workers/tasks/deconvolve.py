@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 from astropy.io.fits import Header
 
@@ -23,22 +22,19 @@ from workers.contract.requests import ResolvedDeconvolve, options_of
 from workers.files.archive import safe_name
 from workers.machine import free_bytes
 from workers.settings import library_versions, software_version
-from workers.tasks.workspace import Result, Workspace
+from workers.tasks.workspace import Result, Workspace, task_of
 
 
-def deconvolve(workspace: Workspace, parameters: Mapping[str, Any]) -> str:
-    """Deconvolve an image; returns the product's id.
+@task_of("deconvolve")
+def deconvolve(workspace: Workspace, request: ResolvedDeconvolve, _identity: str) -> None:
+    """Deconvolve an image, and add the product.
 
     Raises DataError "no-such-image", "no-such-psf", "instrument-changed", "channel-mismatch", "no-noise-figures",
     "already-deconvolved", "psf-as-image", and the errors of reading the image and of the method.
     """
-    request = ResolvedDeconvolve.model_validate(parameters)
-    identity = product_identity(request)
-    if not workspace.has(ResultType.PRODUCT, identity):
-        file = workspace.image_file(request.image_id)
-        workspace.add(make(workspace, request, lambda: load(workspace, request, file)))
-        workspace.report("saving", 1, 1)
-    return identity
+    file = workspace.image_file(request.image_id)
+    workspace.add(make(workspace, request, lambda: load(workspace, request, file)))
+    workspace.report("saving", 1, 1)
 
 
 def load(workspace: Workspace, request: ResolvedDeconvolve, path: Path) -> Image:

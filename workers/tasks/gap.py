@@ -7,7 +7,6 @@ corrected PSF the fit is repeated with the effects of the answer in the model.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -19,24 +18,20 @@ from psfcore.gap.library.registry import Added, added_effects, library_with
 from psfcore.gap.report.report import gap_report
 from psfcore.psf import Psf
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW
-from workers.contract.identities import corrected_psf_identity, diffraction_identity, gap_identity
-from workers.contract.kinds import ResultType
+from workers.contract.identities import corrected_psf_identity, diffraction_identity
 from workers.contract.requests import ResolvedGapDiagnose
 from workers.tasks.results import provenance_of, psf_result, report_result
 from workers.tasks.transits import load_transit
-from workers.tasks.workspace import Workspace
+from workers.tasks.workspace import Workspace, task_of
 
 KIND = "gap"
 _SHOWN = ("sentence", "lines", "verdict", "answer", "gap", "cautions")
 
 
-def gap_diagnose(workspace: Workspace, parameters: Mapping[str, Any]) -> str:
-    """Diagnose the gap of a transit; returns the report's id. If the request asks for it and effects were found, the corrected PSF
+@task_of("gap-diagnose")
+def gap_diagnose(workspace: Workspace, request: ResolvedGapDiagnose, identity: str) -> None:
+    """Diagnose the gap of a transit, and add the report. If the request asks for it and effects were found, the corrected PSF
     is another result."""
-    request = ResolvedGapDiagnose.model_validate(parameters)
-    identity = gap_identity(request)
-    if workspace.has(ResultType.REPORT, identity):
-        return identity
     added = _added(workspace, request)
     parent = None if request.psf_id is None else workspace.psf(request.psf_id)
     transit, _ = load_transit(workspace, request)
@@ -52,7 +47,7 @@ def gap_diagnose(workspace: Workspace, parameters: Mapping[str, Any]) -> str:
         progress=workspace.report,
         solution=workspace.inverter(request),
     )
-    provenance = _provenance(request, parent, added, workspace.job_id)
+    provenance = {"report_id": identity, **_provenance(request, parent, added, workspace.job_id)}
     corrected_id = None
     if request.correct and found.corrected is not None:
         try:
@@ -93,7 +88,6 @@ def gap_diagnose(workspace: Workspace, parameters: Mapping[str, Any]) -> str:
             transit_id=request.transit_id,
         )
     )
-    return identity
 
 
 def _added(workspace: Workspace, request: ResolvedGapDiagnose) -> tuple[Added, ...]:
@@ -130,7 +124,6 @@ def _provenance(
         None if parent is None else {"name": parent.name, "version": parent.version, "id": request.psf_id}
     )
     return {
-        "report_id": gap_identity(request),
         "started_from_psf": started,
         "diffraction_psf_id": diffraction_identity(request),
         "seed": request.seed,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from datetime import datetime
 from typing import Any
@@ -12,30 +11,22 @@ import numpy as np
 from psfcore.psf import CURVE_RADII_PX, Psf, cumulative_curve
 from psfcore.scatter.interpolation import Epoch, curve_sigma, interpolated_psf, parameters_of
 from workers.catalogue.tables import PsfRow
-from workers.contract.identities import interpolated_psf_identity
-from workers.contract.kinds import ResultType
 from workers.contract.requests import PsfInterpolate
 from workers.intake.compatibility import of_upload
 from workers.tasks.catalogue_workspace import CatalogueWorkspace
 from workers.tasks.results import provenance_of, psf_result
+from workers.tasks.workspace import task_of
 from workers.versions import INTERPOLATED, interpolated_name
 
 STAGE = "interpolating the PSF"
 
 
-def psf_interpolate(workspace: CatalogueWorkspace, parameters: Mapping[str, Any]) -> str:
-    """Interpolate between two PSFs of the catalogue, and add the new PSF to it; returns the PSF's id."""
-    return interpolate_psf(workspace, PsfInterpolate.model_validate(parameters))
-
-
-def interpolate_psf(workspace: CatalogueWorkspace, request: PsfInterpolate) -> str:
-    """Interpolate between two PSFs, unless an earlier job did; returns the id of the PSF.
+@task_of("psf-interpolate")
+def psf_interpolate(workspace: CatalogueWorkspace, request: PsfInterpolate, identity: str) -> None:
+    """Interpolate between two PSFs of the catalogue, and add the new PSF to it.
 
     Raises DataError "no-such-psf", and the errors of ``psfcore.scatter.interpolation.interpolated_psf``.
     """
-    identity = interpolated_psf_identity(request)
-    if workspace.has(ResultType.PSF, identity):
-        return identity
     workspace.report(STAGE, 0, 2)
     ends = {
         "before": _epoch(workspace, request.before_psf_id, request.before_time),
@@ -69,7 +60,6 @@ def interpolate_psf(workspace: CatalogueWorkspace, request: PsfInterpolate) -> s
             psf, identity, origin=INTERPOLATED, channel=channel, details=details, threads=workspace.threads
         )
     )
-    return identity
 
 
 def _epoch(workspace: CatalogueWorkspace, psf_id: str, time: str) -> Epoch:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,26 +11,19 @@ from psfcore.errors import DataError
 from psfcore.fits.images import read_plane
 from psfcore.instruments.model import Instrument, parse_instrument
 from workers.contract.identities import recipe_of
-from workers.contract.kinds import ResultType
 from workers.contract.requests import PsfBuild
 from workers.settings import library_versions
 from workers.tasks.results import psf_result
-from workers.tasks.workspace import Workspace
+from workers.tasks.workspace import Workspace, task_of
 from workers.versions import TOTAL
 
 BUILDING = "building the PSF"
 
 
-def psf_build(workspace: Workspace, parameters: Mapping[str, Any]) -> str:
-    """Build a PSF from an instrument file; returns the PSF's id."""
-    return build_psf(workspace, PsfBuild.model_validate(parameters))
-
-
-def build_psf(workspace: Workspace, build: PsfBuild) -> str:
-    """Build the PSF of a recipe, unless an earlier job built it; returns the PSF's id."""
+@task_of("psf-build")
+def psf_build(workspace: Workspace, build: PsfBuild, identity: str) -> None:
+    """Build a PSF from an instrument file."""
     recipe = recipe_of(build)
-    if workspace.has(ResultType.PSF, recipe.identity):
-        return recipe.identity
     instrument = parse_instrument(recipe.text, recipe.name or "instrument_file")
     psf, write = workspace.build(
         recipe, _mount_image(workspace, build, instrument), partial(workspace.report, BUILDING)
@@ -41,7 +32,7 @@ def build_psf(workspace: Workspace, build: PsfBuild) -> str:
     workspace.add(
         psf_result(
             psf,
-            recipe.identity,
+            identity,
             origin="built",
             kind=build.component or TOTAL,
             write=write,
@@ -49,7 +40,6 @@ def build_psf(workspace: Workspace, build: PsfBuild) -> str:
             threads=workspace.threads,
         )
     )
-    return recipe.identity
 
 
 def _mount_image(workspace: Workspace, build: PsfBuild, instrument: Instrument) -> NDArray[np.float64] | None:

@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import partial
-from typing import Any
 
 from psfcore.errors import module_of_extra
 from psfcore.scatter.fit import fit_json, fit_transit, fitted_psf
-from workers.contract.identities import diffraction_identity, psf_fit_identity
-from workers.contract.kinds import ResultType
+from workers.contract.identities import diffraction_identity
 from workers.contract.requests import ResolvedPsfFit
 from workers.tasks.results import provenance_of, psf_result
 from workers.tasks.transits import load_transit
-from workers.tasks.workspace import Workspace
+from workers.tasks.workspace import Workspace, task_of
 
 _SHOWN = ("sentence", "shape", "parameters", "curve", "chi2_per_pixel", "converged", "limits")
 
 
-def psf_fit(workspace: Workspace, parameters: Mapping[str, Any]) -> str:
-    """Fit the scatter to a transit; returns the id of the fitted PSF."""
-    request = ResolvedPsfFit.model_validate(parameters)
-    identity = psf_fit_identity(request)
-    if workspace.has(ResultType.PSF, identity):
-        return identity
+@task_of("psf-fit")
+def psf_fit(workspace: Workspace, request: ResolvedPsfFit, identity: str) -> None:
+    """Fit the scatter to a transit, and add the fitted PSF."""
     transit, prepared = load_transit(workspace, request)
     fit = fit_transit(
         transit,
@@ -59,4 +53,3 @@ def psf_fit(workspace: Workspace, parameters: Mapping[str, Any]) -> str:
             threads=workspace.threads,
         )
     )
-    return identity

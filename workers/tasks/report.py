@@ -2,32 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 
 from psfcore.errors import module_of_extra
 from psfcore.evaluation.shapes import compare_shapes_by_errors
 from psfcore.report.report import make_report, report_json
 from psfcore.transit.transit import Kernel
-from workers.contract.identities import report_identity
-from workers.contract.kinds import ResultType
 from workers.contract.requests import ResolvedReport
 from workers.tasks.results import provenance_of, report_result
 from workers.tasks.transits import load_transit
-from workers.tasks.workspace import Workspace
+from workers.tasks.workspace import Workspace, task_of
 
 KIND = "report"
 POINT_PX = 17
 
 
-def report(workspace: Workspace, parameters: Mapping[str, Any]) -> str:
-    """Make a report on a transit; returns its id."""
-    request = ResolvedReport.model_validate(parameters)
-    identity = report_identity(request)
-    if workspace.has(ResultType.REPORT, identity):
-        return identity
+@task_of("report")
+def report(workspace: Workspace, request: ResolvedReport, identity: str) -> None:
+    """Make a report on a transit."""
     psf = None if request.psf_id is None else workspace.psf(request.psf_id)
     transit, prepared = load_transit(workspace, request, diffraction=None if psf is None else _point())
     report = make_report(
@@ -68,7 +60,6 @@ def report(workspace: Workspace, parameters: Mapping[str, Any]) -> str:
             transit_id=request.transit_id,
         )
     )
-    return identity
 
 
 def _point() -> Kernel:

@@ -6,7 +6,6 @@ The rows of products and PSFs in the catalogue are not changed: only the report 
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -22,7 +21,7 @@ from workers.catalogue.tables import ProductRow, PsfRow
 from workers.contract.identities import rerun_identity
 from workers.contract.kinds import KINDS, ResultType
 from workers.contract.requests import ResolvedRerun
-from workers.lineage import Made, lineage
+from workers.lineage import Creation, lineage
 from workers.tasks.catalogue_workspace import CatalogueWorkspace, ResultRow
 from workers.tasks.results import report_result
 from workers.tasks.workspace import Result
@@ -143,9 +142,8 @@ def _save(
 
 def _made(workspace: CatalogueWorkspace, row: Thing) -> dict[str, Any]:
     made = lineage(workspace.catalogue, row).made
-    assert isinstance(made, Made)
-    told: dict[str, Any] = json.loads(made.model_dump_json(exclude={"parameters"}))
-    return told
+    assert isinstance(made, Creation)
+    return made.model_dump(mode="json", exclude={"parameters"})
 
 
 def _largest(compared: Mapping[str, Comparison]) -> float | None:

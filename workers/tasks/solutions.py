@@ -22,7 +22,7 @@ from psfcore.scatter.shapes import Shape, Vector
 from psfcore.scatter.solution_file import read_solution, write_solution
 from psfcore.transit.transit import Transit
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.owners import OverQuota
+from workers.catalogue.quotas import OverQuota
 from workers.catalogue.tables import SolutionRow
 from workers.contract.identities import canonical_hash, diffraction_identity
 from workers.contract.requests import ResolvedOnTransit
@@ -78,7 +78,7 @@ class KeptSolutions:
             return read_solution(self.store.verified(row.file_sha256), transit, threads=threads)
         except (DataError, FileNotFoundError) as error:
             log.warning("job %s: removed the kept solution %s: %s", self.job_id, identity, error)
-            self.catalogue.owners.forget_solutions([row])
+            self.catalogue.quotas.forget_solutions([row])
         except OSError as error:
             log.warning("job %s: could not read the kept solution %s: %s", self.job_id, identity, error)
         return None

@@ -10,12 +10,12 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from functools import partial
+from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from psfcore.fits.blocks import FitsLimits
-from workers.contract.kinds import ResultType
+from workers.contract.kinds import KINDS, ResultType, Task
 from workers.contract.requests import PsfBuild, ResolvedDeconvolve, ResolvedOnTransit
 from workers.settings import Settings
 from workers.stage_timer import StageTimer
@@ -53,6 +53,29 @@ class Result:
     files: Mapping[str, Callable[[Path], object]]
     columns: Mapping[str, Any] = field(default_factory=dict)
     figures: Callable[[], Sequence[bytes]] = lambda: ()
+
+
+def task_of(kind: str) -> Callable[[Callable[[Any, Any, str], None]], Task]:
+    """Make the task of a kind of job from a function that adds its result: task(workspace, request, identity).
+
+    The task gets the resolved parameters as JSON, and returns the identity of the result. If an earlier job made the result,
+    the function is not called.
+    """
+    row = KINDS[kind]
+
+    def task_from(add: Callable[[Any, Any, str], None]) -> Task:
+        @wraps(add)
+        def task(workspace: Workspace, parameters: Mapping[str, Any]) -> str:
+            assert row.resolved is not None and row.identity is not None
+            request = row.resolved.model_validate(parameters)
+            identity = row.identity(request)
+            if not workspace.has(row.result, identity):
+                add(workspace, request, identity)
+            return identity
+
+        return task
+
+    return task_from
 
 
 class Workspace(ABC):

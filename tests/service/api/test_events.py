@@ -145,7 +145,7 @@ def lookout_of(
     """For the jobs or the bulk runs of the owner."""
     jobs = Kind("job", catalogue.job_changes, JobView.of)
     bulks = Kind("bulk", catalogue.bulk_changes, BulkLine.model_validate)
-    return Lookout(DEFAULT_OWNER, [jobs if kind == "job" else bulks], catalogue.census.clock, let_in)
+    return Lookout(DEFAULT_OWNER, [jobs if kind == "job" else bulks], catalogue.clock, let_in)
 
 
 def follower_of(*named: str, kind: str = "job", since: float | None = None) -> OwnerFollower:

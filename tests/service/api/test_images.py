@@ -26,7 +26,7 @@ from tests.service.vo.made import ENDED_AT, STARTED_AT, add_product, write_produ
 from tests.workers.psf_examples import identity, product, psf
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, ProductRow
-from workers.files.collection import intact
+from workers.files.garbage import intact
 from workers.files.store import Store
 from workers.lineage import provenance, provenance_text
 from workers.settings import Settings

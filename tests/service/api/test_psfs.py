@@ -244,7 +244,7 @@ FEW = {"method": {"name": "richardson-lucy", "steps": 1}}
 
 
 def used_bytes(catalogue: Catalogue) -> int:
-    return catalogue.owners.usage(DEFAULT_OWNER, 0).used_bytes
+    return catalogue.quotas.usage(DEFAULT_OWNER, 0).used_bytes
 
 
 def blobs(settings: Settings) -> set[str]:

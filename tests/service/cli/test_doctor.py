@@ -18,7 +18,6 @@ from tests.tables import RUN_REVISIONS
 from tests.whole.stack import free_port
 from workers import checks
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.census import Census
 from workers.catalogue.schema import Schema
 from workers.catalogue.tables import DEFAULT_OWNER
 from workers.settings import Settings, software_version
@@ -157,9 +156,9 @@ def test_a_database_of_another_version(catalogue: Catalogue) -> None:
 def test_clocks_and_versions_of_workers(catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
     catalogue.census.announce("host:1", time.time(), "0.0.1")
     assert findings()["workers"]["state"] == "warning" and "0.0.1" in findings()["workers"]["found"]
-    real = Census.clock
+    real = Catalogue.clock
     for apart, state in ((0.2, "ok"), (-3.0, "warning"), (60.0, "warning")):
-        monkeypatch.setattr(Census, "clock", lambda self, apart=apart: real(self) + apart)
+        monkeypatch.setattr(Catalogue, "clock", lambda self, apart=apart: real(self) + apart)
         assert states()["clock"] == state, apart
 
 

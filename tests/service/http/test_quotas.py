@@ -41,7 +41,7 @@ def large(path: Path, kib: int) -> Path:
 
 def counted(catalogue: Catalogue) -> int:
     """What the owner of an open service has in its quota."""
-    return catalogue.owners.usage("local", 1).used_bytes
+    return catalogue.quotas.usage("local", 1).used_bytes
 
 
 def fill(catalogue: Catalogue, left_bytes: int) -> None:
@@ -133,7 +133,7 @@ def test_a_bulk_that_fills_the_quota_stops_and_goes_on_with_room(
     assert stopped["phase"] == "ERROR" and stopped["error"]["code"] == "quota-exceeded"
     # The quota is checked before an image is computed; the last product may still be written then.
     assert 0 < stopped["images"]["done"] < 5 and stopped["images"]["failed"] == 0
-    catalogue.owners.set_quota("local", 100)
+    catalogue.quotas.set_quota("local", 100)
     assert api.post(f"{here}/resume").status_code == 200
     while catalogue.bulks.at_work():
         work(catalogue, settings)

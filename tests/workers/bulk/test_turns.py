@@ -24,7 +24,7 @@ from tests.workers.databases import rows
 from tests.workers.jobs import claimed, run_job
 from workers.bulk import image as bulk_image
 from workers.bulk import listing, task
-from workers.bulk.listing import Place
+from workers.bulk.listing import SearchPosition
 from workers.bulk.runs import keep_turns
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
@@ -282,9 +282,9 @@ def test_other_turns_process_images_while_one_lists(run: Run, monkeypatch: pytes
 
 def test_a_place_keeps_every_name(tmp_path: Path) -> None:
     names = ("ä/ö".replace("/", "%"), os.fsdecode(b"\xff%41\n"), "", "plus+space ", "\udcff" * 3)
-    stored = Place(3, names).stored()
+    stored = SearchPosition(3, names).stored()
     assert all(name.isascii() for name in stored["names"])
-    assert Place.of(stored) == Place(3, names)
+    assert SearchPosition.of(stored) == SearchPosition(3, names)
 
 
 def test_an_identical_request_finds_the_open_run(run: Run) -> None:

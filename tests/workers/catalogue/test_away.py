@@ -74,11 +74,11 @@ def test_an_error_without_a_sqlstate_is_of_a_server_that_did_not_answer_or_of_sq
 def test_open_connections_that_fall_silent_are_replaced(proxied: tuple[Catalogue, Proxy]) -> None:
     catalogue, proxy = proxied
     with database(catalogue).reading(), database(catalogue).reading():
-        catalogue.ping()
+        catalogue.clock()
     proxy.freeze()
     started = time.monotonic()
     for _ in range(3):
-        catalogue.ping()
+        catalogue.clock()
         catalogue.check_writable()
     assert PING_S <= time.monotonic() - started < 3 * PING_S, "one is waited for, and all are replaced"
 
@@ -93,7 +93,7 @@ def test_a_statement_that_gets_no_answer_ends(proxied: tuple[Catalogue, Proxy]) 
             session.execute(text("SELECT 1"))
         assert SILENCE_S <= time.monotonic() - started < 2 * SILENCE_S
         assert is_away(error.value) and checks.database_said(error.value) == "no answer within the time limit"
-    catalogue.ping()
+    catalogue.clock()
 
 
 def test_an_upgrade_has_no_limit_and_the_next_transaction_has_it_again(

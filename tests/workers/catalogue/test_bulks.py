@@ -22,7 +22,7 @@ from tests.workers.psf_examples import product
 from workers.bulk import listing
 from workers.catalogue import bulk_progress
 from workers.catalogue import bulks as bulk_rows
-from workers.catalogue.bulks import Listed, new_id
+from workers.catalogue.bulks import BulkImage, new_id
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
 from workers.catalogue.tables import BulkItemRow, BulkRow, ImageRow
@@ -302,14 +302,14 @@ def test_a_second_worker_continues_the_listing_of_a_lost_one(catalogue: Catalogu
     begun = bulks.begin_listing(bulk_id, lost)
     assert begun is not None and begun.listed_to is None
     assert bulks.begin_listing(bulk_id, turn(catalogue)) is None, "another worker lists now"
-    assert bulks.add_listed(bulk_id, lost, [Listed("/a", False), Listed("/b", False, BAD)], B)
+    assert bulks.add_listed(bulk_id, lost, [BulkImage("/a", False), BulkImage("/b", False, BAD)], B)
     catalogue.jobs.give_up_silent(-1.0, 99)
     assert bulks.begin_listing(bulk_id, lost) is None
     other = turn(catalogue)
     begun = bulks.begin_listing(bulk_id, other)
     assert begun is not None and (begun.listed_to, begun.total) == (B, 3)
-    assert not bulks.add_listed(bulk_id, lost, [Listed("/z", False)], C), "the lost one adds nothing more"
-    assert bulks.add_listed(bulk_id, other, [Listed("/c", False)], C)
+    assert not bulks.add_listed(bulk_id, lost, [BulkImage("/z", False)], C), "the lost one adds nothing more"
+    assert bulks.add_listed(bulk_id, other, [BulkImage("/c", False)], C)
     check_counts(catalogue, bulk_id)
     assert not bulks.end_listing(bulk_id, lost) and bulks.end_listing(bulk_id, other)
     assert [one.source[-2:] for one in all_taken(catalogue, bulk_id, other)] == ["00", "/a", "/c"]
@@ -320,8 +320,8 @@ def test_images_are_taken_while_others_are_listed_and_the_run_ends_after_all(cat
     bulk_id, lister, other = made(catalogue, 0, listed=False), turn(catalogue), turn(catalogue)
     bulks = catalogue.bulks
     assert bulks.begin_listing(bulk_id, lister) is not None and bulks.take(bulk_id, other, 3) is None
-    assert bulks.add_listed(bulk_id, lister, [Listed("/a", False)], B)
-    assert bulks.pause(bulk_id) and not bulks.add_listed(bulk_id, lister, [Listed("/b", False)], C)
+    assert bulks.add_listed(bulk_id, lister, [BulkImage("/a", False)], B)
+    assert bulks.pause(bulk_id) and not bulks.add_listed(bulk_id, lister, [BulkImage("/b", False)], C)
     assert bulks.take(bulk_id, lister, 3) is None
     assert bulks.resume(bulk_id) and row(catalogue, bulk_id).phase == BulkPhase.LISTING
     begun = bulks.begin_listing(bulk_id, lister)
@@ -329,7 +329,7 @@ def test_images_are_taken_while_others_are_listed_and_the_run_ends_after_all(cat
     first = one_taken(catalogue, bulk_id, other)
     assert first.source == "/a" and done(catalogue, first)
     assert row(catalogue, bulk_id).phase == "LISTING", "all listed images are done, but not all are listed"
-    assert bulks.add_listed(bulk_id, lister, [Listed("/b", False, BAD), Listed("/c", False)], C)
+    assert bulks.add_listed(bulk_id, lister, [BulkImage("/b", False, BAD), BulkImage("/c", False)], C)
     (second,) = all_taken(catalogue, bulk_id, lister)
     assert (second.source, second.position) == ("/c", 2) and bulks.fail(second, BAD)
     assert bulks.retry(bulk_id) == 2 and row(catalogue, bulk_id).phase == "LISTING"

@@ -21,7 +21,7 @@ from workers.catalogue.census import FileTally
 from workers.catalogue.changes import Moment
 from workers.catalogue.tables import DEFAULT_OWNER, ImageRow, JobRow
 from workers.contract.jobs import Phase
-from workers.stage_timer import Spent
+from workers.stage_timer import StageTime
 from workers.tasks.catalogue_workspace import CatalogueWorkspace
 
 
@@ -42,23 +42,23 @@ def test_the_counts_of_files_and_jobs(catalogue: Catalogue) -> None:
     (waiting, done) = sorted(catalogue.census.tally(), key=lambda tally: tally.kind)
     assert (waiting.phase, waiting.jobs, waiting.attempts, waiting.run_s) == (Phase.QUEUED, 1, 0, 0.0)
     assert (done.phase, done.jobs, done.attempts, done.retries) == (Phase.COMPLETED, 1, 1, 0)
-    assert abs(catalogue.census.clock() - time.time()) < 1.0
+    assert abs(catalogue.clock() - time.time()) < 1.0
 
 
 @BOTH
 def test_times_of_many_attempts_are_summed(catalogue: Catalogue) -> None:
     def add(_: int) -> None:
         for _ in range(10):
-            catalogue.stage_times.add("deconvolve", {"b": Spent(0.5, 2), "a": Spent(0.25, 1)})
+            catalogue.stage_times.add("deconvolve", {"b": StageTime(0.5, 2), "a": StageTime(0.25, 1)})
 
     with ThreadPoolExecutor(4) as pool:
         list(pool.map(add, range(4)))
-    catalogue.stage_times.add("bulk", {"a": Spent(1.0, 0)})
+    catalogue.stage_times.add("bulk", {"a": StageTime(1.0, 0)})
     catalogue.stage_times.add("bulk", {})
     assert catalogue.stage_times.all() == {
-        ("bulk", "a"): Spent(1.0, 0),
-        ("deconvolve", "a"): Spent(10.0, 40),
-        ("deconvolve", "b"): Spent(20.0, 80),
+        ("bulk", "a"): StageTime(1.0, 0),
+        ("deconvolve", "a"): StageTime(10.0, 40),
+        ("deconvolve", "b"): StageTime(20.0, 80),
     }
 
 
@@ -154,8 +154,8 @@ def test_every_change_that_a_reader_can_see_has_a_later_time(catalogue: Catalogu
         times.append(catalogue.job_changes.among(DEFAULT_OWNER, [job.id])[0][0])
         return times[-1] > times[-2]
 
-    assert times[0] == pytest.approx(catalogue.census.clock(), abs=5) and not changed()
-    ahead = catalogue.census.clock() + 3600.0
+    assert times[0] == pytest.approx(catalogue.clock(), abs=5) and not changed()
+    ahead = catalogue.clock() + 3600.0
     change(catalogue, update(JobRow).values(changed_at=ahead))
     assert changed()
     catalogue.jobs.mark_submitted(job.id)
@@ -177,7 +177,7 @@ def test_open_bulk_runs_are_followed_also_when_paused(catalogue: Catalogue) -> N
     catalogue.bulks.cancel(ids[1])
     bulks = catalogue.bulk_changes
     assert [one for _, one in bulks.open("ann")] == [ids[2], ids[0]] and bulks.open("bob") == []
-    changed = [one for _, one in bulks.since("ann", (catalogue.census.clock() - 60, ""))]
+    changed = [one for _, one in bulks.since("ann", (catalogue.clock() - 60, ""))]
     assert changed == [ids[2], ids[0], ids[1]]
 
 

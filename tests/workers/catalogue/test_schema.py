@@ -88,15 +88,20 @@ def test_an_empty_database_gets_its_tables(catalogue: Catalogue, caplog: pytest.
     assert said(caplog) == [f"database: created, revision {status.wanted}"]
 
 
+def later_schema(catalogue: Catalogue, folder: Path) -> Schema:
+    """The schema of a later version, which has one more revision."""
+    shutil.copytree(REVISIONS, folder / "later")
+    (folder / "later" / "versions" / "r0022_later.py").write_text(LATER)
+    return Schema(database(catalogue), folder / "later")
+
+
 def test_an_older_database_is_upgraded_with_its_data(
     catalogue: Catalogue, caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:
     catalogue.upgrade()
     worker = {"name": "w", "started_at": 1.0, "heartbeat_at": 2.0, "version": "0.1.0"}
     change(catalogue, insert(WorkerRow).values(worker))
-    shutil.copytree(REVISIONS, tmp_path / "later")
-    (tmp_path / "later" / "versions" / "r0022_later.py").write_text(LATER)
-    later = Schema(database(catalogue), tmp_path / "later")
+    later = later_schema(catalogue, tmp_path)
     assert later.status().state == "older"
     with pytest.raises(SchemaError, match=r"at revision 0022.*it is at revision 0021.*database upgrade"):
         later.check()
@@ -139,9 +144,7 @@ def test_the_rows_of_revision_0020_get_the_time_of_their_last_change(catalogue: 
 @sqlite_alone
 def test_a_database_that_cannot_be_copied_is_not_upgraded(catalogue: Catalogue, tmp_path: Path) -> None:
     catalogue.upgrade()
-    shutil.copytree(REVISIONS, tmp_path / "later")
-    (tmp_path / "later" / "versions" / "r0022_later.py").write_text(LATER)
-    later = Schema(database(catalogue), tmp_path / "later")
+    later = later_schema(catalogue, tmp_path)
     before = {file.name for file in tmp_path.iterdir()}
 
     def no_room(*_: object) -> None:

@@ -26,7 +26,7 @@ def test_every_kind_but_bulk_can_be_requested() -> None:
     tables: Any = TypeAdapter(JobRequest).validate_python(
         {"kind": "psf-tables", "queue": "bulk", "parameters": {"psf_id": "a" * 64}}
     )
-    assert isinstance(tables, KINDS["psf-tables"].request) and tables.queue == "bulk"
+    assert isinstance(tables, REQUESTS["psf-tables"]) and tables.queue == "bulk"
     for name, model in REQUESTS.items():
         assert KINDS[name].parameters is model.model_fields["parameters"].annotation
         assert KINDS[name].resolved is not None

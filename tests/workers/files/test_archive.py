@@ -90,7 +90,9 @@ def test_each_folder_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     (deep / "x.fits").write_bytes(b"x")
     folders = reads(monkeypatch)
     first = next(archive_files.find(f"{root}/**/*.none", [root]))
-    assert (first.path, first.place, first.matches, folders) == (root, ("",), False, []), "a place to stop"
+    assert (first.path, first.position, first.matches, folders) == (root, ("",), False, []), (
+        "a position to stop"
+    )
     for pattern in ("/**" * 12 + "/*.fits", "/**/d*" * 5 + "/**/*.fits", "/**/*" * 8):
         folders.clear()
         steps = list(archive_files.find(f"{root}{pattern}", [root]))
@@ -114,10 +116,10 @@ def test_a_search_continues_after_every_place_where_it_can_stop(archive: Path) -
     (archive / "2022" / os.fsdecode(b"\xff.fits")).write_bytes(b"x")
     for glob in ("**/*.fits", "**/2*/**/*.fits", "*/*/*.fits", "**/*", "2022/**"):
         whole = list(archive_files.find(f"{archive}/{glob}", [archive]))
-        assert len({step.place for step in whole}) == len(whole)
+        assert len({step.position for step in whole}) == len(whole)
         for number, step in enumerate(whole):
-            rest = list(archive_files.find(f"{archive}/{glob}", [archive], step.place))
-            assert rest == whole[number + 1 :], (glob, step.place)
+            rest = list(archive_files.find(f"{archive}/{glob}", [archive], step.position))
+            assert rest == whole[number + 1 :], (glob, step.position)
 
 
 def test_a_continued_search_reads_no_finished_folder(archive: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,7 +22,7 @@ from tests.workers.psf_examples import psf
 from workers import checks
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ImageRow, PsfRow
-from workers.files import collection, s3_store
+from workers.files import garbage, s3_store
 from workers.files.s3_store import Patience
 from workers.files.store import BadFile, Store, StoreAway, open_store
 from workers.settings import Settings
@@ -159,15 +159,15 @@ def test_the_only_copy_stays_aside_while_the_store_answers_wrongly(
     store: Store, faulty: Faulty, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As in a failover: no such bucket. A row refers to the file."""
-    monkeypatch.setattr(collection, "SETTLED_AFTER_S", -60.0)
+    monkeypatch.setattr(garbage, "SETTLED_AFTER_S", -60.0)
     digest = kept(store, CONTENT)
     assert store.remove(digest, time.time() + 60.0)
     catalogue.add(image(digest))
     for kind in WRONG:
         with faulty.answering(kind), pytest.raises(StoreAway):
-            collection.settle(catalogue, store, {digest})
+            garbage.settle(catalogue, store, {digest})
         assert store.aside() == {digest}, kind
-    collection.settle_old(catalogue, store)
+    garbage.settle_old(catalogue, store)
     assert store.aside() == set() and client_of(store).cat_file(key_of(store, digest)) == CONTENT
 
 
@@ -183,14 +183,14 @@ def test_files_aside_go_once_they_are_confirmed_or_no_row_names_them(
         catalogue.add(image(digest))
     for digest in digests[:4]:
         assert store.size(digest) is not None, "it is needed, and comes back; its copy aside stays"
-    collection.settle_old(catalogue, store)
+    garbage.settle_old(catalogue, store)
     assert store.aside() == set(digests), "they were moved a moment ago"
-    clock = SimpleNamespace(time=lambda: time.time() + collection.SETTLED_AFTER_S + 2.0)
-    monkeypatch.setattr(collection, "time", clock)
+    clock = SimpleNamespace(time=lambda: time.time() + garbage.SETTLED_AFTER_S + 2.0)
+    monkeypatch.setattr(garbage, "time", clock)
     with faulty.answering(share=0.1, hang_s=1.2):
         for _ in range(100):
             with suppress(StoreAway):
-                collection.settle_old(catalogue, store)
+                garbage.settle_old(catalogue, store)
                 break
     assert store.aside() == set()
     assert {blob.digest for blob in store.blobs()} == set(digests[:8])
@@ -218,7 +218,7 @@ def upload(store: Store, catalogue: Catalogue, content: bytes, owner: str) -> bo
 
 def delete(store: Store, catalogue: Catalogue, digest: str, owner: str) -> None:
     catalogue.delete_draft(draft(digest, owner).id, owner)
-    collection.remove_unnamed(catalogue, store, [digest])
+    garbage.remove_unnamed(catalogue, store, [digest])
 
 
 def pair(number: int, store: Store, catalogue: Catalogue) -> str | None:
@@ -245,7 +245,7 @@ def settled(store: Store, catalogue: Catalogue, ended: threading.Event) -> int:
     done = 0
     while not ended.wait(1.0):
         with suppress(StoreAway):
-            collection.settle_old(catalogue, store)
+            garbage.settle_old(catalogue, store)
             done += 1
     return done
 
@@ -262,7 +262,7 @@ def check_pairs(
     end all accepted files are there, and no others.
     """
     # Longer than an upload takes between its file and its row: a call waits for 2 s.
-    monkeypatch.setattr(collection, "SETTLED_AFTER_S", 15.0)
+    monkeypatch.setattr(garbage, "SETTLED_AFTER_S", 15.0)
     ended, before = threading.Event(), (faulty.asked, faulty.faults)
     with faulty.answering(share=0.05, hang_s=1.2):
         with ThreadPoolExecutor(1) as beside, ThreadPoolExecutor(8) as pool:
@@ -272,10 +272,10 @@ def check_pairs(
             finally:
                 ended.set()
             rounds = settling.result()
-        monkeypatch.setattr(collection, "SETTLED_AFTER_S", -60.0)
+        monkeypatch.setattr(garbage, "SETTLED_AFTER_S", -60.0)
         for _ in range(pairs):
             with suppress(StoreAway):
-                collection.settle_old(catalogue, store)
+                garbage.settle_old(catalogue, store)
                 break
     asked, faults = faulty.asked - before[0], faulty.faults - before[1]
     print(f"{pairs} pairs, {len(there)} accepted, {asked} requests, {faults} wrong answers, {rounds} rounds")

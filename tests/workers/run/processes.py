@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from workers.catalogue.catalogue import Catalogue
 from workers.settings import Settings
 
 STOPS_WITHIN_S = 30.0
@@ -22,6 +23,16 @@ sys.modules["workers.tasks.psf_build"] = types.SimpleNamespace(psf_build=task)
 from workers.run.worker import main
 main({options})
 """
+
+
+@contextmanager
+def new_catalogue(settings: Settings) -> Iterator[Catalogue]:
+    """The catalogue of a new data folder, with its tables."""
+    settings.data_dir.mkdir()
+    catalogue = Catalogue(settings.catalogue_url)
+    catalogue.upgrade()
+    yield catalogue
+    catalogue.close()
 
 
 def worker_of(task: str, options: str = "") -> str:

@@ -17,7 +17,7 @@ from celery import Celery
 
 from tests.whole.stack import wait_for
 from tests.workers.jobs import job_row
-from tests.workers.run.processes import started_worker, worker_of
+from tests.workers.run.processes import new_catalogue, started_worker, worker_of
 from workers.broker import app as queue
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow
@@ -92,14 +92,13 @@ class Worker:
 def worker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Worker]:
     folder = tmp_path_factory.mktemp("worker")
     settings = Settings(data_dir=folder / "data", broker_url="filesystem://")
-    settings.data_dir.mkdir()
-    catalogue = Catalogue(settings.catalogue_url)
-    catalogue.upgrade()
     log = folder / "worker.log"
     times = {"stop_s": 0.1, "heartbeat_s": 0.1, "lease_s": LEASE_S, "cancel_s": 0.3}
-    with started_worker(WORKER, settings, log, worker_threads=2, **times) as process:
+    with (
+        new_catalogue(settings) as catalogue,
+        started_worker(WORKER, settings, log, worker_threads=2, **times) as process,
+    ):
         yield Worker(process, catalogue, queue.make_app(settings), log)
-    catalogue.close()
 
 
 def test_a_greedy_job_fails_at_its_limit_and_the_next_one_runs(worker: Worker) -> None:

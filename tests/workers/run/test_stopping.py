@@ -20,9 +20,8 @@ from sqlalchemy.exc import OperationalError
 
 from tests.whole.stack import wait_for
 from tests.workers.jobs import Bench, Task, job_row
-from tests.workers.run.processes import started_worker, worker_of
+from tests.workers.run.processes import new_catalogue, started_worker, worker_of
 from workers.broker import app as queue
-from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
 from workers.catalogue.tables import DEFAULT_OWNER
 from workers.contract.jobs import Phase
@@ -99,7 +98,7 @@ def test_a_heartbeat_that_failed_is_followed_by_another() -> None:
         return True
 
     catalogue = SimpleNamespace(jobs=SimpleNamespace(heartbeat=heartbeat))
-    attempt = Attempt(catalogue, Lease("job", "token"), 0.01, Stopping(), limit_s=60.0)  # type: ignore[arg-type]
+    attempt = Attempt(catalogue, Lease("job", "token"), Settings(heartbeat_s=0.01), Stopping())  # type: ignore[arg-type]
     with attempt.beating():
         assert third.wait(10.0), beats
     assert not attempt.stopped.is_set()
@@ -116,24 +115,21 @@ def task(context, _):
 
 def test_a_worker_that_stops_hands_back_the_job_of_a_deaf_task_and_is_gone(tmp_path: Path) -> None:
     settings = Settings(data_dir=tmp_path / "data", broker_url="filesystem://", stop_s=0.5, heartbeat_s=0.2)
-    settings.data_dir.mkdir()
-    catalogue = Catalogue(settings.catalogue_url)
-    catalogue.upgrade()
-    job, _ = catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)
-    assert queue.submit(queue.make_app(settings), job.id)
     log = tmp_path / "worker.log"
-    with started_worker(DEAF, settings, log, stop_s=0.5, heartbeat_s=0.2, lease_s=3) as worker:
-        wait_for(lambda: job_row(catalogue, job.id).phase == "EXECUTING", "the job is at work")
-        wait_for(lambda: len(catalogue.census.workers(3.0)) == 1, "the worker says that it is there")
-        processes = [psutil.Process(worker.pid), *psutil.Process(worker.pid).children(recursive=True)]
-        worker.send_signal(signal.SIGTERM)
-        status = worker.wait(settings.gone_s + 15.0)  # the machine may be busy
-        _, left = psutil.wait_procs(processes, timeout=5)
-    assert status == 0 and left == [], f"{status}, {left}; {log.read_text()}"
-    row = job_row(catalogue, job.id)
-    assert (row.phase, row.attempt, row.submitted_at) == (Phase.QUEUED, 0, None)
-    assert catalogue.census.workers(60.0) == [], "it took its leave"
-    catalogue.close()
+    with new_catalogue(settings) as catalogue:
+        job, _ = catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)
+        assert queue.submit(queue.make_app(settings), job.id)
+        with started_worker(DEAF, settings, log, stop_s=0.5, heartbeat_s=0.2, lease_s=3) as worker:
+            wait_for(lambda: job_row(catalogue, job.id).phase == "EXECUTING", "the job is at work")
+            wait_for(lambda: len(catalogue.census.workers(3.0)) == 1, "the worker says that it is there")
+            processes = [psutil.Process(worker.pid), *psutil.Process(worker.pid).children(recursive=True)]
+            worker.send_signal(signal.SIGTERM)
+            status = worker.wait(settings.gone_s + 15.0)  # the machine may be busy
+            _, left = psutil.wait_procs(processes, timeout=5)
+        assert status == 0 and left == [], f"{status}, {left}; {log.read_text()}"
+        row = job_row(catalogue, job.id)
+        assert (row.phase, row.attempt, row.submitted_at) == (Phase.QUEUED, 0, None)
+        assert catalogue.census.workers(60.0) == [], "it took its leave"
     lines = [json.loads(line) for line in log.read_text().splitlines()]
     assert "exiting now" in lines[-1]["message"], lines
     (handed_back,) = [line for line in lines if "handed back" in line["message"]]
@@ -143,11 +139,11 @@ def test_a_worker_that_stops_hands_back_the_job_of_a_deaf_task_and_is_gone(tmp_p
 
 
 def test_a_worker_that_ends_by_an_error_has_no_status_of_success(settings: Settings, tmp_path: Path) -> None:
-    settings.data_dir.mkdir()
-    catalogue = Catalogue(settings.catalogue_url)
-    catalogue.upgrade()
-    with started_worker(worker_of("task = None"), settings, tmp_path / "worker.log") as worker:
+    log = tmp_path / "worker.log"
+    with (
+        new_catalogue(settings) as catalogue,
+        started_worker(worker_of("task = None"), settings, log) as worker,
+    ):
         wait_for(lambda: len(catalogue.census.workers(60.0)) == 1, "the worker is there")
         shutil.rmtree(settings.data_dir / "broker" / "queue")
         assert worker.wait(60.0) == 1
-    catalogue.close()

@@ -21,7 +21,7 @@ from sqlalchemy.exc import OperationalError
 from psfcore.compiled import KernelFiles, listening
 from tests.workers.databases import BOTH, change, rows
 from tests.workers.jobs import Bench, claimed
-from tests.workers.run.processes import started_worker, worker_of
+from tests.workers.run.processes import new_catalogue, started_worker, worker_of
 from workers.broker import app as queue
 from workers.broker.reconciler import reconcile
 from workers.catalogue.catalogue import Catalogue
@@ -51,7 +51,7 @@ def test_workers_of_one_host_name_and_process_id_have_different_names() -> None:
         "import os, socket\n"
         "os.getpid = lambda: 1\n"
         "socket.gethostname = lambda: 'worker'\n"
-        "from workers.run.runner import worker_name\n"
+        "from workers.run.child import worker_name\n"
         "print(worker_name() == worker_name(), worker_name())"
     )
     command = [sys.executable, "-c", code]
@@ -80,11 +80,8 @@ def test_a_database_that_is_away_is_waited_for(
 
 
 def test_a_worker_on_a_later_database_ends_with_a_line_and_status_1(settings: Settings) -> None:
-    settings.data_dir.mkdir()
-    catalogue = Catalogue(settings.catalogue_url)
-    catalogue.upgrade()
-    change(catalogue, text("UPDATE alembic_version SET version_num = '9999'"))
-    catalogue.close()
+    with new_catalogue(settings) as catalogue:
+        change(catalogue, text("UPDATE alembic_version SET version_num = '9999'"))
     kept = {name: value for name, value in os.environ.items() if not name.startswith("HELIOPSF_")}
     ended = subprocess.run(
         [sys.executable, "-m", "service.cli", "worker"],

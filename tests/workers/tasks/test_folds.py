@@ -15,7 +15,7 @@ from tests.transit_files import write_transit
 from tests.workers.databases import change
 from tests.workers.jobs import job_row, run_job
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.jobs import Part, Parts
+from workers.catalogue.jobs import Parts
 from workers.catalogue.tables import JobRow, PartRow
 from workers.contract.jobs import Phase
 from workers.run.runner import Runner
@@ -141,4 +141,4 @@ def test_a_part_gets_one_result_from_several_workers(catalogue: Catalogue) -> No
     again = catalogue.parts.take("o", "k" * 64, 60.0)
     assert again is not None and again.number == 1 and catalogue.parts.finish(again, {"a": 4})
     assert catalogue.parts.results("o", "k" * 64) == [{"a": 1}, {"a": 4}]
-    assert catalogue.parts.finish(Part("o", "k" * 64, 9, "x"), {}) is False
+    assert catalogue.parts.finish(PartRow(owner="o", request_key="k" * 64, number=9, token="x"), {}) is False

@@ -55,7 +55,7 @@ def solve(workspace: CatalogueWorkspace, **how: Any) -> Solution:
 
 
 def row(workspace: CatalogueWorkspace) -> SolutionRow:
-    (found,) = workspace.catalogue.owners.solutions_before(np.inf)
+    (found,) = workspace.catalogue.quotas.solutions_before(np.inf)
     return found
 
 
@@ -81,7 +81,7 @@ def test_a_rerun_neither_uses_nor_keeps_one(workspace: CatalogueWorkspace, inver
     for runs, kept in ((1, 0), (3, 1)):
         solve(dataclasses.replace(workspace, anew=True))
         assert len(inverted) == runs
-        assert len(workspace.catalogue.owners.solutions_before(np.inf)) == kept
+        assert len(workspace.catalogue.quotas.solutions_before(np.inf)) == kept
         solve(workspace)
 
 
@@ -126,7 +126,7 @@ def test_one_that_cannot_be_read_is_made_and_kept_again(
         solve(workspace)
         solve(workspace)
         assert len(inverted) == runs
-        assert workspace.catalogue.owners.usage("o", 0).used_bytes == row(workspace).bytes
+        assert workspace.catalogue.quotas.usage("o", 0).used_bytes == row(workspace).bytes
 
 
 def test_storage_that_does_not_answer_costs_time_only(
@@ -149,10 +149,10 @@ def test_without_room_or_if_it_is_too_large_it_is_not_kept_and_the_job_goes_on(
     with monkeypatch.context() as patched:
         patched.setattr("psfcore.scatter.solution_file.MOST_BYTES", 1000)
         solve(workspace)
-    assert workspace.catalogue.owners.solutions_before(np.inf) == [] == list(workspace.store.blobs())
+    assert workspace.catalogue.quotas.solutions_before(np.inf) == [] == list(workspace.store.blobs())
     image = ImageRow(owner="o", id="2" * 64, created_at=1.0, bytes=2**19, summary={})
-    workspace.catalogue.owners.set_quota("o", 1)
+    workspace.catalogue.quotas.set_quota("o", 1)
     workspace.catalogue.add(image)
     solve(workspace)
-    assert workspace.catalogue.owners.solutions_before(np.inf) == []
-    assert workspace.catalogue.owners.usage("o", 0).used_bytes == image.bytes
+    assert workspace.catalogue.quotas.solutions_before(np.inf) == []
+    assert workspace.catalogue.quotas.usage("o", 0).used_bytes == image.bytes

@@ -56,7 +56,7 @@ def begun(client: TestClient, images: list[str], psf: str, **more: object) -> st
 
 
 def used(service: Keyed, owner: str = "ann") -> int:
-    return service.catalogue.owners.usage(owner, 0).used_bytes
+    return service.catalogue.quotas.usage(owner, 0).used_bytes
 
 
 def test_the_run_goes_and_its_products_and_files_stay(

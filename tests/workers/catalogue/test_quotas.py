@@ -11,7 +11,7 @@ from tests.workers.databases import BOTH
 from tests.workers.jobs import claimed, job_row
 from tests.workers.psf_examples import OWNER, certify, identity, product, psf, refused
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.owners import MIB, OverQuota
+from workers.catalogue.quotas import MIB, OverQuota
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, SolutionRow
 
 
@@ -34,19 +34,19 @@ def test_simultaneous_uploads_are_accepted_up_to_the_quota(catalogue: Catalogue)
     with ThreadPoolExecutor(8) as pool:
         came_in = list(pool.map(lambda n: send(catalogue, image(n, MIB // 4)), range(12)))
     assert sum(came_in) == 4
-    assert catalogue.owners.usage("o", 1).used_bytes == MIB
+    assert catalogue.quotas.usage("o", 1).used_bytes == MIB
     assert [catalogue.get(ImageRow, f"{n:064x}", "o") is not None for n in range(12)] == came_in
 
 
 def test_an_owner_s_own_limit_counts_and_results_of_jobs_are_not_held_to_it(catalogue: Catalogue) -> None:
-    catalogue.owners.set_quota("o", 2)
+    catalogue.quotas.set_quota("o", 2)
     assert send(catalogue, image(1, 2 * MIB)) and not send(catalogue, image(2, 1))
-    catalogue.owners.set_quota("o", 0)
+    catalogue.quotas.set_quota("o", 0)
     assert send(catalogue, image(2, 1))
-    catalogue.owners.set_quota("o", None)
+    catalogue.quotas.set_quota("o", None)
     assert not send(catalogue, image(3, 1)) and send(catalogue, image(3, 1), quota_mib=0)
     assert catalogue.add(image(4, MIB))[1]
-    assert catalogue.owners.usage("o", 1).used_bytes == 3 * MIB + 2
+    assert catalogue.quotas.usage("o", 1).used_bytes == 3 * MIB + 2
 
 
 def solution(number: int, size_bytes: int, owner: str = "o") -> SolutionRow:
@@ -56,7 +56,7 @@ def solution(number: int, size_bytes: int, owner: str = "o") -> SolutionRow:
 
 def kept(catalogue: Catalogue) -> list[str]:
     """Owner and number of each kept solution."""
-    return sorted(f"{row.owner}{int(row.id, 16)}" for row in catalogue.owners.solutions_before(1e9))
+    return sorted(f"{row.owner}{int(row.id, 16)}" for row in catalogue.quotas.solutions_before(1e9))
 
 
 @BOTH
@@ -64,13 +64,13 @@ def test_the_oldest_solutions_make_room_for_an_upload(catalogue: Catalogue) -> N
     for number in (2, 1, 3):
         assert catalogue.add(solution(number, MIB // 4), 1)[1]
     assert catalogue.add(solution(1, MIB // 4, owner="p"), 1)[1]
-    usage = catalogue.owners.usage("o", 1)
+    usage = catalogue.quotas.usage("o", 1)
     assert (usage.used_bytes, usage.removable_bytes) == (3 * MIB // 4, 3 * MIB // 4)
     assert usage.allows(MIB) and not usage.allows(MIB + 1)
     assert send(catalogue, image(9, MIB // 2)) and kept(catalogue) == ["o2", "o3", "p1"]
     assert not send(catalogue, image(8, MIB)) and kept(catalogue) == ["o2", "o3", "p1"]
     assert send(catalogue, image(7, MIB // 2)) and kept(catalogue) == ["p1"]
-    assert catalogue.owners.usage("o", 1).full
+    assert catalogue.quotas.usage("o", 1).full
 
 
 def test_a_new_solution_takes_the_room_of_older_ones_only_and_is_forgotten_once(catalogue: Catalogue) -> None:
@@ -78,15 +78,15 @@ def test_a_new_solution_takes_the_room_of_older_ones_only_and_is_forgotten_once(
     for number in (1, 2):
         assert catalogue.add(solution(number, MIB // 2), 1)[1]
     assert kept(catalogue) == ["o2"] and catalogue.get(ImageRow, f"{1:064x}", "o") is not None
-    assert not catalogue.owners.usage("o", 1).full, "jobs run: a solution is no file that must stay"
+    assert not catalogue.quotas.usage("o", 1).full, "jobs run: a solution is no file that must stay"
     with pytest.raises(OverQuota):
         catalogue.add(solution(3, MIB), 1)
     assert kept(catalogue) == ["o2"]
-    assert catalogue.owners.solutions_before(2.0) == []
-    old = catalogue.owners.solutions_before(3.0)
+    assert catalogue.quotas.solutions_before(2.0) == []
+    old = catalogue.quotas.solutions_before(3.0)
     for _ in range(2):
-        catalogue.owners.forget_solutions(old)
-    assert kept(catalogue) == [] and catalogue.owners.usage("o", 0).used_bytes == MIB // 2
+        catalogue.quotas.forget_solutions(old)
+    assert kept(catalogue) == [] and catalogue.quotas.usage("o", 0).used_bytes == MIB // 2
 
 
 @BOTH
@@ -95,10 +95,10 @@ def test_the_files_of_each_kind_count_and_nobody_else_s(catalogue: Catalogue) ->
         rows = [psf("a", bytes=5), product("p", "a"), image(1, 7, OWNER), solution(2, 11, OWNER)]
         assert [catalogue.add(row)[1] for row in rows] == [new] * 4
     catalogue.add(image(1, 13, "somebody"))
-    usage = catalogue.owners.usage(OWNER, 1)
+    usage = catalogue.quotas.usage(OWNER, 1)
     assert usage.used_bytes == sum(row.bytes for row in rows) and usage.removable_bytes == 11
-    assert [one.owner for one in catalogue.owners.all(1)] == sorted([OWNER, "somebody"])
-    assert catalogue.owners.limited(OWNER, 1) == usage and catalogue.owners.limited(OWNER, 0) is None
+    assert [one.owner for one in catalogue.quotas.all(1)] == sorted([OWNER, "somebody"])
+    assert catalogue.quotas.limited(OWNER, 1) == usage and catalogue.quotas.limited(OWNER, 0) is None
 
 
 # Deletions ------------------------------------------------------------------------------------------
@@ -127,11 +127,11 @@ def test_a_draft_is_deleted_unless_something_uses_it(catalogue: Catalogue) -> No
         ("never", "no-such-psf", ""),
     ):
         assert told in refused(code, partial(catalogue.delete_draft, identity(name), OWNER))
-    before = catalogue.owners.usage(OWNER, 0).used_bytes
+    before = catalogue.quotas.usage(OWNER, 0).used_bytes
     free = catalogue.get(PsfRow, identity("free"), OWNER)
     assert free is not None and catalogue.delete_draft(free.id, OWNER).name == "free"
     assert catalogue.get(PsfRow, identity("free"), OWNER) is None
-    assert catalogue.owners.usage(OWNER, 0).used_bytes == before - free.bytes
+    assert catalogue.quotas.usage(OWNER, 0).used_bytes == before - free.bytes
 
 
 def test_a_deleted_result_is_made_again_by_a_new_job(catalogue: Catalogue) -> None:

@@ -18,9 +18,9 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from psfcore.errors import DataError
-from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.owners import KEPT, UPLOADED, WITH_FILES, FileRow
-from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, ReportRow, SolutionRow, TransitRow
+from workers.catalogue.catalogue import Catalogue, Row
+from workers.catalogue.quotas import KEPT, WITH_FILES, FileRow
+from workers.catalogue.tables import ImageRow, SolutionRow, TransitRow
 from workers.files.store import Blob, FileState, Store, StoreAway
 from workers.settings import Settings
 
@@ -32,40 +32,41 @@ SECOND_LOOK_AFTER_S = 10.0
 # Other files may be new when they are moved aside. An upload adds its row directly after it has stored its file, a job
 # within a minute, and both may wait for other writers of the database.
 SETTLED_AFTER_S = 300.0
-# Entries of a row's details that name further files.
-NAMED_IN_DETAILS = (
-    "changes_picture_sha256",
-    "output_sha256",
-    "page_sha256",
-    "page_texts_sha256",
-    "report_sha256",
-    "tables_sha256",
-    "thumbnail_sha256",
-)
+# The entries of a row's details that name the further files of a result, by the names of the files.
+ENTRIES = {
+    "tables": "tables_sha256",
+    "report": "report_sha256",
+    "html": "page_sha256",
+    "texts": "page_texts_sha256",
+    "changes": "changes_picture_sha256",
+    "thumbnail": "thumbnail_sha256",
+}
 
 
-def files_of(row: ProductRow | PsfRow | ReportRow) -> Iterator[tuple[str, int | None]]:
-    """SHA-256 and size (bytes; None: not recorded) of each file of a result; its main file comes first."""
-    yield row.file_sha256, row.bytes
-    if row.preview_sha256 is not None:
-        yield row.preview_sha256, None
-    for name in NAMED_IN_DETAILS:
-        if row.details.get(name) is not None:
-            yield row.details[name], None
-    for digest in row.details.get("figures_sha256", ()):
-        yield digest, None
+def files_of(row: FileRow) -> list[tuple[str, int | None]]:
+    """SHA-256 and size (bytes; None: not recorded) of each file of a row; its main file comes first."""
+    if isinstance(row, ImageRow | TransitRow):
+        return [(row.id, row.bytes)]
+    if isinstance(row, SolutionRow):
+        return [(row.file_sha256, row.bytes)]
+    named = [row.details.get(entry) for entry in (*ENTRIES.values(), "output_sha256")]
+    further = [row.preview_sha256, *named, *row.details.get("figures_sha256", ())]
+    return [(row.file_sha256, row.bytes), *((digest, None) for digest in further if digest is not None)]
 
 
-def intact(store: Store, row: ProductRow | PsfRow | ReportRow) -> bool:
-    """Whether the store has all files of a result, each with its recorded size. The content of the files is not read.
+def intact(store: Store, row: FileRow) -> bool:
+    """Whether the store has all files of a row, each with its recorded size. The content of the files is not read.
 
     Raises ``StoreAway``.
     """
-    for digest, expected in files_of(row):
-        size = store.size(digest)
-        if size is None or expected not in (None, size):
-            return False
-    return True
+    sizes = ((store.size(digest), expected) for digest, expected in files_of(row))
+    return all(size is not None and expected in (None, size) for size, expected in sizes)
+
+
+def intact_row(catalogue: Catalogue, store: Store, table: type[Row], identity: str, owner: str) -> Row | None:
+    """The row of a result with this identity; None if there is none, or if one of its files is lost. Raises ``StoreAway``."""
+    row = catalogue.get(table, identity, owner)
+    return row if row is not None and intact(store, row) else None
 
 
 @dataclass(frozen=True)
@@ -74,11 +75,6 @@ class Fault:
 
     row: FileRow
     files: tuple[tuple[str, FileState], ...]
-
-    @property
-    def what(self) -> str:
-        """The kind of the row whose file is lost or damaged, for example "product"."""
-        return self.row.thing()
 
 
 def examine(catalogue: Catalogue, store: Store, *, content: bool = True) -> Iterator[Fault]:
@@ -91,7 +87,7 @@ def examine(catalogue: Catalogue, store: Store, *, content: bool = True) -> Iter
     for table in WITH_FILES:
         for row in catalogue.named_files.kept(table):
             bad = []
-            for digest, size in _files(row):
+            for digest, size in files_of(row):
                 if digest not in states:
                     states[digest] = store.state(digest, size, content=content)
                 if states[digest] != "good":
@@ -100,18 +96,8 @@ def examine(catalogue: Catalogue, store: Store, *, content: bool = True) -> Iter
                 yield Fault(row, tuple(bad))
 
 
-def _files(row: FileRow) -> Iterator[tuple[str, int | None]]:
-    match row:
-        case ImageRow() | TransitRow():
-            yield row.id, row.bytes
-        case SolutionRow():
-            yield row.file_sha256, row.bytes
-        case _:
-            yield from files_of(row)
-
-
 @dataclass(frozen=True)
-class Collected:
+class Collection:
     """The result of a collection: the files of the store, and the removed files.
 
     removed: in a dry run, the files that would be removed.
@@ -135,7 +121,7 @@ def collect(
     dry_run: bool = False,
     even_most: bool = False,
     second_look_after_s: float = SECOND_LOOK_AFTER_S,
-) -> Collected:
+) -> Collection:
     """Remove files that were last stored more than ``older_than_s`` seconds ago, if no row, or only the row of an old
     solution, refers to them.
 
@@ -146,7 +132,7 @@ def collect(
     kept_before = time.time() - older_than_s
     there = {blob.digest: blob for blob in store.blobs()}
     left = dict(there)
-    solutions = catalogue.owners.solutions_before(kept_before)
+    solutions = catalogue.quotas.solutions_before(kept_before)
     for digest in catalogue.named_files.all(solutions_from=kept_before):
         left.pop(digest, None)
     if there and len(left) == len(there):
@@ -166,9 +152,9 @@ def collect(
             "all, add --even-most",
         )
     if not dry_run:
-        catalogue.owners.forget_solutions(solutions)
+        catalogue.quotas.forget_solutions(solutions)
         old = _removed(old, catalogue, store, kept_before, second_look_after_s)
-    return Collected(len(there), sum(blob.bytes for blob in there.values()), tuple(old))
+    return Collection(len(there), sum(blob.bytes for blob in there.values()), tuple(old))
 
 
 def remove_unnamed(catalogue: Catalogue, store: Store, digests: Iterable[str]) -> None:
@@ -234,7 +220,7 @@ def retain(catalogue: Catalogue, store: Store, settings: Settings) -> dict[tuple
     deleted: dict[tuple[str, str], list[int]] = defaultdict(list)
     for (owner, kind), days in settings.kept_days.items():
         others = [other for other, of in settings.kept_days if other and of == kind]
-        for of, identity, size in catalogue.owners.old(kind, time.time() - days * DAY_S, owner, others):
+        for of, identity, size in catalogue.quotas.old(kind, time.time() - days * DAY_S, owner, others):
             if settings.keep_dry_run or _delete(catalogue, store, kind, of, identity):
                 deleted[of, kind].append(size)
     done = "would delete" if settings.keep_dry_run else "deleted"
@@ -251,6 +237,5 @@ def _delete(catalogue: Catalogue, store: Store, kind: str, owner: str, identity:
         return catalogue.bulks.delete(identity)
     row = catalogue.delete(KEPT[kind], identity, owner)
     if row is not None:
-        named = [identity] if kind in UPLOADED else [digest for digest, _ in files_of(row)]
-        remove_unnamed(catalogue, store, named)
+        remove_unnamed(catalogue, store, [digest for digest, _ in files_of(row)])
     return row is not None

@@ -27,12 +27,12 @@ from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ImageRow, JobRow, PsfRow, ReportRow, SolutionRow
 from workers.contract.bulk import BulkPhase
 from workers.contract.jobs import Phase
-from workers.files import collection
-from workers.files.collection import DAY_S, retain
+from workers.files import garbage
+from workers.files.garbage import DAY_S, retain
 from workers.files.store import Store
 from workers.settings import Settings
 
-collect = partial(collection.collect, second_look_after_s=0.0)
+collect = partial(garbage.collect, second_look_after_s=0.0)
 
 
 class Killed(BaseException):
@@ -119,10 +119,10 @@ def test_old_solutions_go_with_their_files(store: Store, catalogue: Catalogue) -
     )  # the same solution, made by another owner later
     dry = collect(catalogue, store, -60.0, dry_run=True)
     assert {blob.digest for blob in dry.removed} == {old, third}
-    assert len(catalogue.owners.solutions_before(1e12)) == 4, "nothing was removed"
+    assert len(catalogue.quotas.solutions_before(1e12)) == 4, "nothing was removed"
     assert collect(catalogue, store, -60.0) == dry
     assert digests(store) == {named, shared}
-    assert [row.owner for row in catalogue.owners.solutions_before(1e12)] == ["q"]
+    assert [row.owner for row in catalogue.quotas.solutions_before(1e12)] == ["q"]
 
 
 # Removal beside uploads --------------------------------------------------------------------------------
@@ -134,7 +134,7 @@ def draft(digest: str, owner: str) -> PsfRow:
 
 def delete(catalogue: Catalogue, store: Store, row: PsfRow) -> None:
     catalogue.delete_draft(row.id, row.owner)
-    collection.remove_unnamed(catalogue, store, [row.file_sha256])
+    garbage.remove_unnamed(catalogue, store, [row.file_sha256])
 
 
 def test_a_file_is_there_for_the_row_that_comes_after_another_owner_deleted_it(
@@ -145,13 +145,13 @@ def test_a_file_is_there_for_the_row_that_comes_after_another_owner_deleted_it(
     kept(store, b"same bytes")  # the upload of another owner has stored its file, but not yet added its row
     time.sleep(0.01)
     delete(catalogue, store, draft(other, "a"))
-    collection.remove_unnamed(catalogue, store, [orphan])
+    garbage.remove_unnamed(catalogue, store, [orphan])
     assert store.aside() == {other, orphan}
-    collection.settle_old(catalogue, store)
+    garbage.settle_old(catalogue, store)
     assert store.aside() == {other, orphan}, "they were moved aside a moment ago"
     catalogue.add(draft(other, "b"))
-    monkeypatch.setattr(collection, "SETTLED_AFTER_S", -60.0)
-    collection.settle_old(catalogue, store)
+    monkeypatch.setattr(garbage, "SETTLED_AFTER_S", -60.0)
+    garbage.settle_old(catalogue, store)
     assert elsewhere(store, tmp_path).verified(other).read_bytes() == b"same bytes"
     assert digests(store) == {other} and store.aside() == set()
 
@@ -239,23 +239,21 @@ def test_a_file_that_is_sent_at_the_moment_of_its_removal_is_not_lost(
             catalogue.add(image(orphan))
 
     clock = SimpleNamespace(time=time.time, sleep=sleep)
-    monkeypatch.setattr(collection, "time", clock)
+    monkeypatch.setattr(garbage, "time", clock)
     before_removal(remote, monkeypatch, orphan, lambda: kept(remote, b"sent long ago"))
-    removed = collection.collect(catalogue, remote, -60.0, even_most=True).removed
+    removed = garbage.collect(catalogue, remote, -60.0, even_most=True).removed
     assert [blob.digest for blob in removed] == [other]
-    assert waits == [collection.SECOND_LOOK_AFTER_S]
+    assert waits == [garbage.SECOND_LOOK_AFTER_S]
     assert elsewhere(remote, tmp_path).path(orphan).read_bytes() == b"sent long ago"
     assert orphan in names(remote, "blobs") and names(remote, "aside") == set()
-    assert collection.collect(catalogue, remote, -60.0).removed == () and len(waits) == 1, (
-        "nothing to wait for"
-    )
+    assert garbage.collect(catalogue, remote, -60.0).removed == () and len(waits) == 1, "nothing to wait for"
 
 
 def test_a_collection_killed_anywhere_loses_nothing(
     remote: Store, catalogue: Catalogue, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     catalogue.add(image(kept(remote, b"a")))
-    monkeypatch.setattr(collection, "SETTLED_AFTER_S", -60.0)
+    monkeypatch.setattr(garbage, "SETTLED_AFTER_S", -60.0)
     for steps in range(1, 20):
         content = f"sent long ago {steps}".encode()
         sent, orphan = kept(remote, content), kept(remote, f"orphan {steps}".encode())
@@ -319,7 +317,7 @@ def test_a_collection_beside_a_running_service_loses_no_file(
 def test_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     settings = Settings(data_dir=tmp_path / "data")
     monkeypatch.setenv("HELIOPSF_DATA_DIR", str(settings.data_dir))
-    monkeypatch.setattr(collection, "time", SimpleNamespace(time=time.time, sleep=lambda _: None))
+    monkeypatch.setattr(garbage, "time", SimpleNamespace(time=time.time, sleep=lambda _: None))
     store, catalogue = Store(settings.data_dir), Catalogue(settings.catalogue_url)
     catalogue.upgrade()
     catalogue.add(image(kept(store, b"a")))

@@ -23,7 +23,7 @@ from workers.contract.identities import request_identity
 from workers.contract.jobs import Phase, Queue
 from workers.contract.kinds import KINDS, ResultType
 from workers.contract.requests import PsfTables
-from workers.files.collection import Fault, intact
+from workers.files.garbage import Fault, intact_row
 from workers.files.store import Store
 from workers.lineage import made_by
 
@@ -39,8 +39,8 @@ def reopened(job: JobRow, catalogue: Catalogue, store: Store) -> bool:
     table = TABLES.get(KINDS[job.kind].result)
     if job.phase != Phase.COMPLETED or table is None or job.result_id is None:
         return False
-    row = catalogue.get(table, job.result_id, job.owner)
-    return (row is None or not intact(store, row)) and catalogue.jobs.reopen(job.id)
+    row = intact_row(catalogue, store, table, job.result_id, job.owner)
+    return row is None and catalogue.jobs.reopen(job.id)
 
 
 def without_results(jobs: Sequence[JobRow], catalogue: Catalogue) -> frozenset[str]:
@@ -58,13 +58,6 @@ def without_results(jobs: Sequence[JobRow], catalogue: Catalogue) -> frozenset[s
     return frozenset(gone)
 
 
-def there(result: ResultType, identity: str, owner: str, catalogue: Catalogue, store: Store) -> bool:
-    """Whether the catalogue has the result with this identity, with all its files. Raises ``StoreAway``."""
-    table = TABLES.get(result)
-    row = None if table is None else catalogue.get(table, identity, owner)
-    return row is not None and intact(store, row)
-
-
 def repair(fault: Fault, catalogue: Catalogue, store: Store) -> str:
     """Set damaged files aside, and queue the job that makes the result again.
 
@@ -76,7 +69,7 @@ def repair(fault: Fault, catalogue: Catalogue, store: Store) -> str:
             store.set_aside(digest)
     match row:
         case SolutionRow():
-            catalogue.owners.forget_solutions([row])
+            catalogue.quotas.forget_solutions([row])
             return "removed; the next job on the transit makes it again"
         case ImageRow() | TransitRow():
             return f"owner {row.owner} must upload the file again ({row.filename or 'without a name'})"

@@ -115,7 +115,7 @@ class OverQuota(Exception):
         self.usage = usage
 
 
-class Owners(Queries):
+class Quotas(Queries):
     """The limits of owners, and what they keep."""
 
     def usage(self, owner: str, quota_mib: int) -> Usage:
@@ -146,7 +146,7 @@ class Owners(Queries):
         return self._database.all(select(SolutionRow).where(SolutionRow.created_at < time))
 
     def forget_solutions(self, rows: Sequence[SolutionRow]) -> None:
-        """Remove these kept solutions. Their files stay until ``workers.files.collection`` removes them."""
+        """Remove these kept solutions. Their files stay until ``workers.files.garbage`` removes them."""
         for row in rows:
             self._database.change(_removal(row))
 
@@ -250,7 +250,7 @@ def hold_to_quota(session: Session, row: FileRow, quota_mib: int) -> None:
 
     If the file does not fit, the owner's oldest kept solutions are removed until it fits. If it would not fit even
     without any kept solution, raises OverQuota. If several uploads fit one by one but not together, the last ones are
-    refused. quota_mib: as for ``Owners.usage``.
+    refused. quota_mib: as for ``Quotas.usage``.
     """
     now = _limited(session, row.owner, quota_mib)
     if now is None or now.limit_bytes is None:
