@@ -26,7 +26,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Matrix = NDArray[np.float64]
+Vector = NDArray[np.float64]  # (n,)
+Matrix = NDArray[np.float64]  # (rows, columns), or more axes
+Plane = NDArray[np.float64]  # [y, x] of an image
+Kernel = NDArray[np.float64]  # weights [y, x] of a PSF, with the centre at [ny // 2, nx // 2]
+Flags = NDArray[np.bool_]
 
 # Share of B's largest eigenvalue: a direction whose eigenvalue is smaller is undetermined.
 WEAKEST_DIRECTION = 1e-15

@@ -29,6 +29,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.arrays import Kernel
 from psfcore.convolution.convolver import linear_convolve
 from psfcore.diffraction.fraunhofer import far_field, samples_per_pixel
 from psfcore.diffraction.mesh_series import (
@@ -46,7 +47,6 @@ STEPS_A_PUPIL = 20  # steps of progress for each component
 AIRY, ENTRANCE_MESH, MOUNT, ENTRANCE = "AIRY", "ENTRANCE_MESH", "MOUNT", "ENTRANCE"
 FILTER_WHEEL, DIFFRACTION = "FILTER_WHEEL", "DIFFRACTION"
 
-Kernel = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
 

@@ -32,12 +32,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.arrays import Vector
 from psfcore.convolution.convolver import linear_convolve
 from psfcore.diffraction.fresnel import (
     SAMPLING_MARGIN,
     FresnelStep,
     Grid,
-    Vector,
     Wave,
     binned_light,
     fraunhofer_field,

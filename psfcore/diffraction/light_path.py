@@ -33,10 +33,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from psfcore.arrays import Vector
 from psfcore.diffraction.fresnel import (
     FresnelStep,
     Grid,
-    Vector,
     Wave,
     binned_light,
     common_openings_mm,

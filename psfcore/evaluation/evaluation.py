@@ -44,14 +44,12 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.arrays import Flags, Kernel, Plane, Vector
 from psfcore.errors import DataError
 from psfcore.scatter.reconstruction import LEAST_DARK_PIXELS, Progress, dark_pixels
-from psfcore.scatter.shapes import Vector
 from psfcore.scatter.total_psf import Optics, Pixels, noise_covariance, pick, put
 from psfcore.transit.occulter import DOUBT_SIGMAS, FoundPlace, find_occulter
-from psfcore.transit.transit import Frame, Kernel, Transit
-
-Map = NDArray[np.float64]
+from psfcore.transit.transit import Frame, Transit
 
 CENTRE_PX = 2.0
 LEAST_SHARE = 0.5  # a position is on the maps if it is dark in at least this fraction of the images
@@ -77,7 +75,7 @@ class Slice:
     offset_px: Vector
     observed: Vector
     simulated: Vector
-    dark: NDArray[np.bool_]
+    dark: Flags
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +150,7 @@ class FrameEvaluation:
         return 100 * self.centre_noise_dn_s / self.observed_dn_s
 
 
-def at_centre(dark: Pixels, found: FoundPlace) -> NDArray[np.bool_]:
+def at_centre(dark: Pixels, found: FoundPlace) -> Flags:
     """The mask of the dark pixels within CENTRE_PX of the centre of the occulter."""
     place = found.place
     return np.asarray(np.hypot(dark[0] - place.y_px, dark[1] - place.x_px) <= CENTRE_PX)
@@ -161,7 +159,7 @@ def at_centre(dark: Pixels, found: FoundPlace) -> NDArray[np.bool_]:
 # --- maps ------------------------------------------------------------------------------------------------
 
 
-def superposed_maps(frames: Sequence[FrameEvaluation], values: Sequence[Vector], half_px: int) -> Map:
+def superposed_maps(frames: Sequence[FrameEvaluation], values: Sequence[Vector], half_px: int) -> Plane:
     """Values of the dark pixels of each image by whole-pixel offset from the centre of its occulter; nan elsewhere.
 
     The result has the shape (images, 2 half_px + 1, 2 half_px + 1).
@@ -188,10 +186,10 @@ class Superposed:
 
     images: int
     count: NDArray[np.int64]
-    mpe_pct: Map
-    mape_pct: Map
-    noise_mpe_pct: Map
-    noise_mape_pct: Map
+    mpe_pct: Plane
+    mape_pct: Plane
+    noise_mpe_pct: Plane
+    noise_mape_pct: Plane
 
     @property
     def half_px(self) -> int:
@@ -229,7 +227,7 @@ class Superposed:
         return float(np.nanmax(self.mape_pct))
 
 
-def superposed(pe_pct: Map, noise_pct: Map) -> Superposed:
+def superposed(pe_pct: Plane, noise_pct: Plane) -> Superposed:
     """The maps of Eq. (4), at positions that are dark in at least LEAST_SHARE of the images.
 
     pe_pct: PE of each image, as `superposed_maps` returns it. noise_pct: the same for each noise realisation, with the
@@ -250,7 +248,7 @@ def superposed(pe_pct: Map, noise_pct: Map) -> Superposed:
     )
 
 
-def _rms(values: Map) -> float:
+def _rms(values: Plane) -> float:
     return float(np.sqrt(np.nanmean(values**2)))
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from psfcore.arrays import Vector
 from psfcore.drawing.plots import (
     CHANGE,
     boxed_legend,
@@ -21,7 +22,6 @@ from psfcore.drawing.plots import (
 )
 from psfcore.evaluation.evaluation import Evaluation, FrameEvaluation, Superposed
 from psfcore.evaluation.report import each, sentence
-from psfcore.scatter.shapes import Vector
 from psfcore.scatter.validation.robustness import DarkOffsetStudy
 
 _OBSERVED, _SIMULATED = "#444444", "#c2402f"

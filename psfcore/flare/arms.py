@@ -36,16 +36,14 @@ import numpy as np
 from scipy import ndimage
 from threadpoolctl import threadpool_limits
 
+from psfcore.arrays import Flags, Plane, Vector
 from psfcore.errors import DataError
 from psfcore.flare.arms_fit import (
     NEEDED_ORDERS_AN_ARM,
     FitResult,
     FitState,
-    Flags,
     Geometry,
     Orders,
-    Plane,
-    Vector,
     first_fit,
     first_source,
     iterate,

@@ -12,12 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from psfcore.arrays import Flags, Plane, Vector
 from psfcore.errors import DataError
 
-Vector = NDArray[np.float64]
 Indices = NDArray[np.intp]
-Plane = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 NEEDED_ORDERS_AN_ARM = 3
 KNOT_PX = 1.0  # distance between the knots of the spline

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from psfcore.arrays import Flags, Plane
 from psfcore.errors import DataError
 from psfcore.fits.units import parse_unit, rate_label, unit_label
 from psfcore.flare.arm_profile import BOX_PX, FlareComparison, compare_on_flare, flare_centre
@@ -19,8 +19,6 @@ from psfcore.psf_sampling import check_compatible
 ENOUGH_EXPLAINED = 0.5
 WELL_MATCHED_PCT = 3.0
 
-Plane = NDArray[np.float64]
-
 
 @dataclass(frozen=True, eq=False)
 class FlareTest:
@@ -31,7 +29,7 @@ class FlareTest:
 
     comparison: FlareComparison
     difference: Plane
-    usable: NDArray[np.bool_]
+    usable: Flags
     unit: str
 
 
@@ -114,7 +112,7 @@ def _variance(noise: Noise, image: Image) -> Plane:
 
 
 def _measured_arm(
-    light: Plane, quiet: Plane, usable: NDArray[np.bool_], centre_xy: tuple[int, int], reach_px: float
+    light: Plane, quiet: Plane, usable: Flags, centre_xy: tuple[int, int], reach_px: float
 ) -> float:
     """The direction (degrees) of the arm nearest to +x, measured out to reach_px."""
     try:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from psfcore.arrays import Kernel
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits
 from psfcore.gap.effect import Effect
@@ -28,7 +29,7 @@ from psfcore.gap.view import View
 from psfcore.instruments.files import instrument_names
 from psfcore.scatter.inversion import invert
 from psfcore.scatter.reconstruction import Progress
-from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Kernel
+from psfcore.scatter.shapes import SOFTENED_POWER_LAW
 from psfcore.simulate.inputs import LARGEST_DIFFRACTION_PX, diffraction_kernel, read_plan
 from psfcore.simulate.plan import Plan
 from psfcore.simulate.scatter_truth import ScatterTruth

@@ -16,13 +16,12 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.arrays import Flags, Vector
 from psfcore.scatter.reconstruction import Solution
 from psfcore.scatter.total_psf import Blur, Lanes, put
 from psfcore.transit.occulter import coverage, disc_distance, neighbours_of, patch_window
 
 Field = NDArray[np.float32]
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
 Result = TypeVar("Result")
 DISC_MARGIN_PX = 2.0
 # Most memory for one kind of field; at least LEAST_KEPT fields are kept, whatever their size.
@@ -148,7 +147,7 @@ class View:
             sums[frame.pointing] = (total + scene * away, count + away)
         return sums
 
-    def _own(self, n: int) -> tuple[Field, NDArray[np.bool_]]:
+    def _own(self, n: int) -> tuple[Field, Flags]:
         """The scene of frame n, and a mask of the pixels away from its disc."""
         solution = self.solution
         place = solution.sky.found[n].place

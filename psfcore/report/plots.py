@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from psfcore.arrays import Matrix, Vector
 from psfcore.drawing.page import PLOT_DPI
 from psfcore.drawing.plots import (
     FARTHEST_PX,
@@ -37,7 +37,6 @@ from psfcore.evaluation.plots import (
 from psfcore.evaluation.report import each
 from psfcore.report.report import CrossValidated, PsfReport
 from psfcore.scatter.fit import RADII_PX, TransitFit
-from psfcore.scatter.shapes import Vector
 from psfcore.scatter.total_psf import DIFFRACTION, SCATTER
 from psfcore.scatter.validation.cross_validation import ShellBands
 from psfcore.scatter.validation.robustness import DarkOffsetStudy
@@ -101,7 +100,7 @@ def _draw_spread(axes: Any, report: PsfReport, name: str) -> None:
     along_distance(axes, max(report.transit.shape), "Distance R (px)")
 
 
-def _folds_of(report: PsfReport, name: str) -> tuple[Vector, NDArray[np.float64]] | None:
+def _folds_of(report: PsfReport, name: str) -> tuple[Vector, Matrix] | None:
     """Two arrays: radii, and the bands of the folds minus the fitted curve of a component.
 
     None if there is no cross-validation or it has no bands of this component.

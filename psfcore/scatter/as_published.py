@@ -37,6 +37,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares, lsq_linear
 from threadpoolctl import threadpool_limits
 
+from psfcore.arrays import Kernel, Matrix, Vector
 from psfcore.convolution.convolver import Convolver
 from psfcore.convolution.engine import Engine
 from psfcore.deconvolve.conditions import Conditions, PreparedPsfs
@@ -54,12 +55,9 @@ from psfcore.psf import (
 )
 from psfcore.scatter.reconstruction import Progress
 from psfcore.scatter.segments import Segments, segment_sums, shells_as_published
-from psfcore.scatter.shapes import Vector
-from psfcore.scatter.total_psf import Kernel
 from psfcore.transit.occulter import FoundPlace, disc_distance, find_occulter, fully_dark
 from psfcore.transit.transit import Frame, Transit
 
-Matrix = NDArray[np.float64]
 Solve = Callable[
     [Matrix, Vector], tuple[Vector, float]
 ]  # to the coefficients and their sum of squared misfits

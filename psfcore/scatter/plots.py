@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
-from numpy.typing import NDArray
 
+from psfcore.arrays import Kernel, Vector
 from psfcore.drawing.plots import (
     FARTHEST_PX,
     INK,
@@ -32,7 +32,6 @@ from psfcore.psf import REACH_GRID_PX, cumulative_curve, radial_profile
 from psfcore.scatter.as_published import Published
 from psfcore.scatter.fit import TransitFit, fit_sentence
 from psfcore.scatter.inversion import CONVERGED_POINTS
-from psfcore.scatter.shapes import Vector
 from psfcore.scatter.validation.cross_validation import LIMITS, Bands, FoldFit, ShellBands
 from psfcore.transit.first_guess import ESTIMATORS
 
@@ -103,7 +102,7 @@ def _fitted_weights(fit: TransitFit) -> tuple[Vector, Vector, Vector]:
     """
     shape, at = fit.inversion.shape, fit.inversion.coordinates
 
-    def rings(kernel: NDArray[np.float64]) -> tuple[Vector, Vector]:
+    def rings(kernel: Kernel) -> tuple[Vector, Vector]:
         radius, mean = radial_profile(kernel)
         shown = (radius >= 1) & (radius <= FARTHEST_PX)
         return radius[shown], mean[shown]

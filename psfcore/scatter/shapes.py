@@ -38,13 +38,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.arrays import Kernel, Matrix, Vector
 from psfcore.compiled import compiled
 from psfcore.errors import DataError
 from psfcore.psf import REACH_GRID_PX, squared_radii
 
 Values = Mapping[str, float]
-Kernel = NDArray[np.float64]
-Vector = NDArray[np.float64]
 
 FARTHEST = 700.0  # exp of a larger coordinate is no double
 DIFFERENCE = 1e-3  # step of a coordinate for central differences
@@ -126,7 +125,7 @@ class Shape:
         """Parameter values by name at these coordinates."""
         return {p.name: p.value(float(q)) for p, q in zip(self.parameters, coordinates, strict=True)}
 
-    def value_sigma(self, coordinates: Vector, covariance: NDArray[np.float64]) -> dict[str, float]:
+    def value_sigma(self, coordinates: Vector, covariance: Matrix) -> dict[str, float]:
         """Standard errors of the parameters by name. covariance: that of the coordinates."""
         return {
             p.name: abs(p.slope(float(q))) * float(sigma)

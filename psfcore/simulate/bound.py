@@ -35,8 +35,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from psfcore.arrays import Kernel, Plane
 from psfcore.convolution.convolver import Convolver
 from psfcore.errors import DataError
 from psfcore.psf import CURVE_RADII_PX, REACH_GRID_PX, cumulative_curve, encircled_energy
@@ -50,8 +50,6 @@ from psfcore.simulate.scatter_truth import (
 )
 from psfcore.simulate.sky import TrueSky, fully_dark, on_field
 
-Plane = NDArray[np.float64]
-Kernel = NDArray[np.float64]
 Window = tuple[slice, slice]
 
 PLACE_MARGIN_PX = 5.0

@@ -18,9 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from psfcore.arrays import Plane
 from psfcore.build import build_psf
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits
@@ -43,8 +41,6 @@ from psfcore.simulate.plan import (
 from psfcore.simulate.scene import scene_from_image
 from psfcore.transit.folder import times_s
 from psfcore.transit.manifest import MANIFEST_NAME, MAX_MANIFEST_BYTES, TransitManifest, parse_manifest
-
-Plane = NDArray[np.float64]
 
 LARGEST_DIFFRACTION_PX = 2048
 LARGEST_SIZE_PX = 4096

@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, zoom
 
+from psfcore.arrays import Plane
 from psfcore.convolution.convolver import Convolver
 from psfcore.errors import DataError
 from psfcore.fits.images import write_image
@@ -25,8 +25,6 @@ from psfcore.image import Image
 from psfcore.noise import Noise
 from psfcore.psf import Psf
 from psfcore.simulate.plan import CAMERA, DISC, EAST, WEST, Plan
-
-Plane = NDArray[np.float64]
 
 QUIET_DN_PER_S = 420.0
 SKY_DN_PER_S = 12.0
@@ -301,7 +299,7 @@ def _filament(x: Plane, y: Plane) -> Plane:
 
 
 def observe(
-    scene: NDArray[np.float64],
+    scene: Plane,
     psf: Psf,
     *,
     exposure_s: float,
@@ -309,7 +307,7 @@ def observe(
     read_noise_dn: float,
     seed: int,
     threads: int = 1,
-) -> NDArray[np.float64]:
+) -> Plane:
     """Convolve `scene` [y, x] with the PSF, then add photon noise and read noise; both arrays are in DN/s.
 
     The scene is assumed dark outside its array. If photon_gain_dn and read_noise_dn are 0, the image is noise-free.

@@ -31,8 +31,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from psfcore.arrays import Flags, Kernel, Plane
 from psfcore.convolution.convolver import Convolver
 from psfcore.errors import DataError
 from psfcore.psf import REACH_GRID_PX
@@ -40,9 +40,6 @@ from psfcore.simulate.plan import Plan
 from psfcore.simulate.scatter_truth import ScatterTruth, total_kernel
 from psfcore.simulate.scene import drawn_scene
 from psfcore.transit.transit import Place
-
-Plane = NDArray[np.float64]
-Kernel = NDArray[np.float64]
 
 _SUM_TOLERANCE = 1e-3
 _PLACE_STEP_PX = 1e-3
@@ -197,7 +194,7 @@ def _half_segment(x: Plane, r: float) -> Plane:
     return np.asarray((x * root + r**2 * np.arcsin(np.clip(x / r, -1, 1))) / 2)
 
 
-def fully_dark(place: Place, first: tuple[int, int], shape: tuple[int, int]) -> NDArray[np.bool_]:
+def fully_dark(place: Place, first: tuple[int, int], shape: tuple[int, int]) -> Flags:
     """True for pixels [y, x] whose four corners all lie inside the disc. first, shape: see covered_share."""
     y = np.abs(first[0] + np.arange(shape[0]) - place.y_px) + 0.5
     x = np.abs(first[1] + np.arange(shape[1]) - place.x_px) + 0.5

@@ -41,6 +41,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.arrays import Kernel, Plane
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.images import CardValue, read_plane, write_plane
@@ -50,9 +51,6 @@ from psfcore.simulate.scatter_truth import ScatterTruth
 from psfcore.simulate.sky import TrueSky, true_sky
 from psfcore.transit.manifest import MANIFEST_NAME
 from psfcore.transit.transit import Frame, Place, Transit
-
-Plane = NDArray[np.float64]
-Kernel = NDArray[np.float64]
 
 TRUTH_FILE = "truth.json"
 DIFFRACTION_FILE = "diffraction.fits"

@@ -26,7 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.gap.view import Matrix, Vector
+from psfcore.arrays import Flags, Matrix, Vector
 from psfcore.scatter.reconstruction import Solution
 from psfcore.scatter.total_psf import Optics, Pixels, put
 
@@ -63,7 +63,7 @@ def cells_of(dark: Pixels, x_px: float, y_px: float) -> Cells:
     r = np.hypot(dx, dy)
     share = r / max(float(r.max()), 1e-9)
     angle = np.arctan2(dy, dx)
-    members: list[NDArray[np.bool_]] = []
+    members: list[Flags] = []
     for low, high, sectors in RINGS:
         ring = (share >= low) & ((share < high) | (high >= 1.0))
         sector = np.floor((angle + np.pi / sectors) / (2 * np.pi / sectors)).astype(int) % sectors

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psfcore.gap.view import Vector
+from psfcore.arrays import Vector
 from psfcore.noise import Noise
 from psfcore.transit.transit import Frame, Transit
 

@@ -36,11 +36,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from psfcore.arrays import Matrix, Vector
 from psfcore.convolution.convolver import correlations
 from psfcore.gap.evidence.cells import cells_of, coarse_kernel, sensitivities, whitening
 from psfcore.gap.evidence.linear_model import FLOOR
 from psfcore.gap.evidence.unocculted_blocks import block_means
-from psfcore.gap.view import Field, Matrix, Vector, View
+from psfcore.gap.view import Field, View
 from psfcore.psf import crop_or_pad
 from psfcore.scatter.total_psf import Optics
 

@@ -21,7 +21,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.gap.view import Matrix, Vector, View
+from psfcore.arrays import Flags, Matrix, Vector
+from psfcore.gap.view import View
 from psfcore.scatter.reconstruction import Progress
 from psfcore.transit.occulter import disc_distance
 
@@ -49,12 +50,12 @@ class UnoccultedBlocks:
 
     levels: Matrix
     variance: Matrix
-    free: NDArray[np.bool_]
+    free: Flags
     means: Matrix
-    errors: NDArray[np.float64]
+    errors: Matrix
     pointing: NDArray[np.int64]
     kind: NDArray[np.int64]
-    part: NDArray[np.bool_]
+    part: Flags
     across: int
     given_gain_width: float | None = None
 

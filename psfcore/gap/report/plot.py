@@ -16,15 +16,14 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Wedge
-from numpy.typing import NDArray
 
+from psfcore.arrays import Flags, Plane, Vector
 from psfcore.drawing.page import PLOT_DPI
 from psfcore.drawing.plots import CHANGE, INK, png_of, tidy
 from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.evidence.cells import RINGS, DiscCells
 from psfcore.gap.report.report import fits_of, percent_words
 
-Vector = NDArray[np.float64]
 Report = dict[str, Any]
 
 WIDTH_IN = 9.9
@@ -297,7 +296,7 @@ def largest_residual(found: Diagnosis) -> int:
     return found.evidence.discs[int(np.argmax(size))].index
 
 
-def simulated_of(found: Diagnosis, n: int, *, with_answer: bool = False) -> NDArray[np.float64]:
+def simulated_of(found: Diagnosis, n: int, *, with_answer: bool = False) -> Plane:
     """The model image of image n [y, x], DN/s. with_answer: whether to add the change by the named effects."""
     raw = found.solution.transit.frames[n].pixels
     solution = found.corrected.solution if with_answer and found.corrected else found.solution
@@ -337,7 +336,7 @@ def _column(rows: Sequence[dict[str, Any]], name: str) -> Vector:
     return np.array([np.nan if row[name] is None else row[name] for row in rows], dtype=np.float64)
 
 
-def _looks(rows: Sequence[dict[str, Any]]) -> dict[int, tuple[NDArray[np.bool_], str, str]]:
+def _looks(rows: Sequence[dict[str, Any]]) -> dict[int, tuple[Flags, str, str]]:
     """For each pointing: which images belong to it (images,), its colour and its symbol."""
     pointing = _column(rows, "fov")
     looks = itertools.cycle(zip(_COLOURS, _SYMBOLS, strict=True))

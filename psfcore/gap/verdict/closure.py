@@ -36,8 +36,8 @@ from typing import Any
 
 import numpy as np
 
+from psfcore.arrays import Vector
 from psfcore.gap.evidence.linear_model import LinearModel
-from psfcore.gap.view import Vector
 from psfcore.transit.transit import Fold, folds
 
 RESAMPLES = 1000
