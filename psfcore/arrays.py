@@ -1,4 +1,4 @@
-"""Arrays of results: their JSON values, their hashes, the differences between two of them, and the covariance of a fit.
+"""Arrays of numbers: their kinds, their squares, their JSON values and hashes, differences, and the covariance of a fit.
 
 The covariance is the inverse of a normal matrix whose parameters have different units:
 
@@ -100,6 +100,16 @@ def array_sha256(array: NDArray[Any]) -> str:
     """
     plain = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
     return hashlib.sha256(plain.tobytes()).hexdigest()
+
+
+def squares(planes: NDArray[Any], edge: int) -> NDArray[Any]:
+    """Planes [..., y, x], divided into squares of `edge` px: (..., rows, edge, columns, edge).
+
+    Incomplete squares in the last rows and columns are left out.
+    """
+    rows, columns = (n // edge for n in planes.shape[-2:])
+    cut = planes[..., : rows * edge, : columns * edge]
+    return cut.reshape(*planes.shape[:-2], rows, edge, columns, edge)
 
 
 def scaled_inverse(normal: Matrix, *, weakest: float = WEAKEST_DIRECTION) -> Matrix:

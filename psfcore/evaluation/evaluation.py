@@ -181,7 +181,9 @@ class Superposed:
     """Maps [y, x] by offset from the centre of the occulter, which is at [half_px, half_px]; nan outside the disc.
 
     images: number of superposed discs. count: for each position, the number of images in which this pixel is dark.
-    noise_mpe_pct: standard error of the MPE from noise alone. noise_mape_pct: MAPE of noise alone.
+    noise_mpe_pct: standard error of the MPE from noise alone. noise_mape_pct: MAPE of noise alone. mpe_rms_pct,
+    mpe_largest_pct: rms and largest absolute value of the MPE over the map. mape_mean_pct, mape_largest_pct: mean and
+    largest value of the MAPE. mpe_noise_rms_pct, mape_noise_mean_pct: what noise alone gives.
     """
 
     images: int
@@ -190,41 +192,17 @@ class Superposed:
     mape_pct: Plane
     noise_mpe_pct: Plane
     noise_mape_pct: Plane
+    mpe_rms_pct: float
+    mpe_largest_pct: float
+    mpe_noise_rms_pct: float
+    mape_mean_pct: float
+    mape_largest_pct: float
+    mape_noise_mean_pct: float
 
     @property
     def half_px(self) -> int:
         """The index of the centre in both axes."""
         return self.count.shape[0] // 2
-
-    @property
-    def mpe_rms_pct(self) -> float:
-        """The rms of the MPE over the map."""
-        return _rms(self.mpe_pct)
-
-    @property
-    def mpe_noise_rms_pct(self) -> float:
-        """The expected rms of the MPE from noise alone."""
-        return _rms(self.noise_mpe_pct)
-
-    @property
-    def mpe_largest_pct(self) -> float:
-        """The largest |MPE| of the map."""
-        return float(np.nanmax(np.abs(self.mpe_pct)))
-
-    @property
-    def mape_mean_pct(self) -> float:
-        """The mean of the MAPE over the map."""
-        return float(np.nanmean(self.mape_pct))
-
-    @property
-    def mape_noise_mean_pct(self) -> float:
-        """The expected mean of the MAPE from noise alone."""
-        return float(np.nanmean(self.noise_mape_pct))
-
-    @property
-    def mape_largest_pct(self) -> float:
-        """The largest MAPE of the map."""
-        return float(np.nanmax(self.mape_pct))
 
 
 def superposed(pe_pct: Plane, noise_pct: Plane) -> Superposed:
@@ -236,15 +214,23 @@ def superposed(pe_pct: Plane, noise_pct: Plane) -> Superposed:
     count = np.isfinite(pe_pct).sum(axis=0)
     shown = count >= max(LEAST_SHARE * len(pe_pct), 1)
     over, realisations = np.where(shown, count, np.nan), max(len(noise_pct), 1)
-    noise_mpe = np.nansum(noise_pct, axis=1) / over
-    noise_mape = np.nansum(np.abs(noise_pct), axis=1)
+    of_noise = np.nansum(noise_pct, axis=1) / over
+    mpe, mape = np.nansum(pe_pct, axis=0) / over, np.nansum(np.abs(pe_pct), axis=0) / over  # Eq. (4)
+    noise_mpe = np.sqrt(np.sum(of_noise**2, axis=0) / realisations)
+    noise_mape = np.sum(np.nansum(np.abs(noise_pct), axis=1), axis=0) / realisations / over
     return Superposed(
         images=len(pe_pct),
         count=count,
-        mpe_pct=np.nansum(pe_pct, axis=0) / over,  # Eq. (4)
-        mape_pct=np.nansum(np.abs(pe_pct), axis=0) / over,  # Eq. (4)
-        noise_mpe_pct=np.sqrt(np.sum(noise_mpe**2, axis=0) / realisations),
-        noise_mape_pct=np.sum(noise_mape, axis=0) / realisations / over,
+        mpe_pct=mpe,
+        mape_pct=mape,
+        noise_mpe_pct=noise_mpe,
+        noise_mape_pct=noise_mape,
+        mpe_rms_pct=_rms(mpe),
+        mpe_largest_pct=float(np.nanmax(np.abs(mpe))),
+        mpe_noise_rms_pct=_rms(noise_mpe),
+        mape_mean_pct=float(np.nanmean(mape)),
+        mape_largest_pct=float(np.nanmax(mape)),
+        mape_noise_mean_pct=float(np.nanmean(noise_mape)),
     )
 
 

@@ -52,10 +52,9 @@ _FREE, _BAND = "#1f6fb4", "#4f8cc4"
 def curves_png(report: PsfReport) -> bytes:
     """1 - encircled energy of the total PSF. For a fit, also of its diffuse scatter, with the uncertainties below."""
     if report.fit is None:
-        figure, (total,) = _figure(5.6, 3.9, 1)
-        _draw_curve(total, report, TOTAL, "Total PSF")
-        legend(total, 8)
-        charts = [total]
+        figure, charts = _figure(5.6, 3.9, 1)
+        _draw_curve(charts[0], report, TOTAL, "Total PSF")
+        legend(charts[0], 8)
     else:
         figure, charts = _figure(WIDTH_IN, 7.0, 2, 2, heights=(1.3, 1.0))
         for axes, name, title in zip(
@@ -73,8 +72,7 @@ def curves_png(report: PsfReport) -> bytes:
             low, high = axes.get_ylim()
             axes.set_ylim(low, high + 0.45 * (high - low))  # room for the legend
             legend(axes, 7.5, ncols=2)
-    tidy(charts)
-    return png_of(figure)
+    return _tidy_png(figure, charts)
 
 
 def _draw_curve(axes: Any, report: PsfReport, name: str, title: str) -> None:
@@ -175,8 +173,7 @@ def profile_png(report: PsfReport) -> bytes:
     axes.set(yscale="log", ylim=(min(lowest) / 5, 2), ylabel="Mean weight (fraction of the light per pixel)")
     along_distance(axes, max(report.transit.shape), "Distance from the centre (px)")
     legend(axes)
-    tidy([axes])
-    return png_of(figure)
+    return _tidy_png(figure, [axes])
 
 
 def weights_png(report: PsfReport, shells: ShellBands) -> bytes:
@@ -191,8 +188,7 @@ def weights_png(report: PsfReport, shells: ShellBands) -> bytes:
     axes.set_ylabel("Diffuse weight (fraction of the light per pixel)")
     along_distance(axes, field_px)
     legend(axes)
-    tidy([axes])
-    return png_of(figure)
+    return _tidy_png(figure, [axes])
 
 
 def totals_png(cross: CrossValidated, fit: TransitFit) -> bytes:
@@ -204,8 +200,7 @@ def totals_png(cross: CrossValidated, fit: TransitFit) -> bytes:
     draw_totals(axes, cross.bands.totals, _BAND)
     axes.axvline(total, color=_COLOURS[SCATTER], linewidth=1.6, label="fit to all images")
     legend(axes, loc="best")
-    tidy([axes])
-    return png_of(figure)
+    return _tidy_png(figure, [axes])
 
 
 def slices_png(evaluation: Evaluation) -> bytes:
@@ -219,8 +214,7 @@ def slices_png(evaluation: Evaluation) -> bytes:
         boxed_legend(axes, 7, "upper center")
     for axes in charts[len(shown) :]:
         axes.set_visible(False)
-    tidy(charts)
-    return png_of(figure)
+    return _tidy_png(figure, charts)
 
 
 def maps_png(maps: Superposed) -> bytes:
@@ -244,8 +238,7 @@ def residuals_png(evaluation: Evaluation) -> bytes:
     labelled = charts[0].get_legend_handles_labels()
     style: dict[str, Any] = {"ncols": 8, "fontsize": 9, "frameon": False}
     figure.legend(*labelled, title="pointing", loc="outside upper center", **style)
-    tidy(charts)
-    return png_of(figure)
+    return _tidy_png(figure, charts)
 
 
 def intensities_png(evaluation: Evaluation) -> bytes:
@@ -253,8 +246,7 @@ def intensities_png(evaluation: Evaluation) -> bytes:
     figure, charts = _figure(WIDTH_IN, 3.9, 2)
     draw_centres(charts[0], evaluation.frames)
     draw_absolute(charts[1], evaluation.frames)
-    tidy(charts)
-    return png_of(figure)
+    return _tidy_png(figure, charts)
 
 
 def offsets_png(study: DarkOffsetStudy) -> bytes:
@@ -264,6 +256,11 @@ def offsets_png(study: DarkOffsetStudy) -> bytes:
     for axes, title in zip(charts, ("Diffuse weights", "1 - encircled energy"), strict=True):
         axes.set_title(title)
         boxed_legend(axes, 7.5)
+    return _tidy_png(figure, charts)
+
+
+def _tidy_png(figure: Figure, charts: list[Any]) -> bytes:
+    """A figure as PNG, with tidy charts."""
     tidy(charts)
     return png_of(figure)
 

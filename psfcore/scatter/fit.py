@@ -441,9 +441,13 @@ def fit_json(fit: TransitFit) -> dict[str, Any]:
         for s in fit.shapes
     ]
     if fit.free is not None:
-        out["free_shells"] = _free_json(fit.free)
+        out["free_shells"] = {
+            "edges_px": list(fit.free.segments.edges_px),
+            "weight": limits_json(fit.free.weights_pct(LIMITS)),
+            "diffuse_light_beyond_inner_edge_pct": limits_json(fit.free.beyond_pct(LIMITS)),
+        }
     if fit.published is not None:
-        out["as_published"] = _published_json(fit)
+        out["as_published"] = _published_json(fit, fit.published)
     return out
 
 
@@ -467,17 +471,7 @@ def _curve_json(curve: Curve) -> dict[str, list[float]]:
     }
 
 
-def _free_json(free: ShellWeightFits) -> dict[str, Any]:
-    return {
-        "edges_px": list(free.segments.edges_px),
-        "weight": limits_json(free.weights_pct(LIMITS)),
-        "diffuse_light_beyond_inner_edge_pct": limits_json(free.beyond_pct(LIMITS)),
-    }
-
-
-def _published_json(fit: TransitFit) -> dict[str, Any]:
-    published = fit.published
-    assert published is not None
+def _published_json(fit: TransitFit, published: Published) -> dict[str, Any]:
     here = dict(zip(fit.curve.radii_px, fit.curve.pct, strict=True))
 
     def one(p: Published) -> dict[str, Any]:

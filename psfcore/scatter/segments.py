@@ -44,7 +44,7 @@ from numpy.typing import NDArray
 
 from psfcore.compiled import compiled
 from psfcore.errors import DataError
-from psfcore.psf import REACH_GRID_PX, squared_radii
+from psfcore.psf import REACH_GRID_PX, crop_or_pad, squared_radii
 
 # This radius is slightly larger than 1448.15 px, the distance of the corner of the reach grid from its centre.
 FULL_REACH_PX = 1449.0
@@ -110,14 +110,7 @@ class Segments:
 
         The value is -1 at the centre, outside all shells, and outside the reach grid.
         """
-        whole = self._reach_map
-        out = np.full((size, size), -1, dtype=np.int32)
-        reach = self.reach_grid_px
-        shift = reach // 2 - size // 2
-        source = slice(max(shift, 0), min(shift + size, reach))
-        target = slice(source.start - shift, source.stop - shift)
-        out[target, target] = whole[source, source]
-        return out
+        return np.asarray(crop_or_pad(self._reach_map + 1.0, size) - 1, dtype=np.int32)
 
     def mean_of_map(self, kernel: Floats) -> Floats:
         """psf_S of Eq. (2) for any kernel [y, x] on the reach grid, array (size,). It is 0 for empty segments."""

@@ -17,7 +17,7 @@ import numpy as np
 from astropy.io import fits
 from scipy.ndimage import gaussian_filter, zoom
 
-from psfcore.arrays import Plane
+from psfcore.arrays import Kernel, Plane
 from psfcore.convolution.convolver import Convolver
 from psfcore.errors import DataError
 from psfcore.fits.images import write_image
@@ -298,6 +298,12 @@ def _filament(x: Plane, y: Plane) -> Plane:
     return np.asarray(ends * np.exp(-(((y - spine) / 0.013) ** 2)))
 
 
+def seen_through(kernel: Kernel, scene: Plane, *, threads: int = 1) -> Plane:
+    """A scene [y, x] convolved with a kernel, on the pixels of the scene, which is dark outside them."""
+    field = (scene.shape[0], scene.shape[1])
+    return np.asarray(Convolver(kernel, field, dtype=np.float64, threads=threads).apply(scene), np.float64)
+
+
 def observe(
     scene: Plane,
     psf: Psf,
@@ -312,12 +318,11 @@ def observe(
 
     The scene is assumed dark outside its array. If photon_gain_dn and read_noise_dn are 0, the image is noise-free.
     """
-    field = (scene.shape[0], scene.shape[1])
-    seen = Convolver(psf.kernel, field, dtype=np.float64, threads=threads).apply(scene)
+    seen = seen_through(psf.kernel, scene, threads=threads)
     if photon_gain_dn == read_noise_dn == 0:
         return np.maximum(seen, 0.0)  # rounding in the transforms makes some dark pixels slightly negative
     noise = Noise(photon_gain_dn, read_noise_dn)
-    return noise.observe(np.asarray(seen), exposure_s, np.random.default_rng(seed))
+    return noise.observe(seen, exposure_s, np.random.default_rng(seed))
 
 
 def demo_image(path: str | Path, psf: Psf, *, size: int = 1024, seed: int = 1) -> None:

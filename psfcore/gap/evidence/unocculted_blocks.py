@@ -21,7 +21,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.arrays import Flags, Matrix, Vector
+from psfcore.arrays import Flags, Matrix, Vector, squares
 from psfcore.gap.view import View
 from psfcore.scatter.reconstruction import Progress
 from psfcore.transit.occulter import disc_distance
@@ -181,9 +181,7 @@ def block_px(shape: tuple[int, int]) -> int:
 
 def block_means(plane: NDArray[np.floating], edge: int) -> Matrix:
     """The means of a plane [y, x] over squares of `edge` px. Incomplete squares in the last rows and columns are dropped."""
-    rows, columns = (n // edge for n in plane.shape)
-    cut = plane[: rows * edge, : columns * edge]
-    return np.asarray(cut.reshape(rows, edge, columns, edge).mean(axis=(1, 3), dtype=np.float64))
+    return np.asarray(squares(plane, edge).mean(axis=(1, 3), dtype=np.float64))
 
 
 def blocks(plane: NDArray[np.floating]) -> Vector:

@@ -155,10 +155,7 @@ def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold])
         spread[tuple(held)] = _spread(along[:, :cells]), _spread(along)
     if not rows:
         return None
-    chi2, of_cells, blocks_chi2, of_blocks, residual, noise_pct = np.array(rows).T
-    return HeldOut(
-        tuple(images), chi2, of_cells, blocks_chi2, of_blocks, residual, noise_pct, deviance, spread
-    )
+    return HeldOut(tuple(images), *np.array(rows).T, deviance=deviance, spread=spread)
 
 
 def _error(jacobian: Vector, covariance: Vector) -> float:
