@@ -1,4 +1,4 @@
-"""Arrays of numbers: their kinds, their squares, their JSON values and hashes, differences, and the covariance of a fit.
+"""Arrays of numbers: their kinds, windows and squares, their JSON values and hashes, differences, and the covariance of a fit.
 
 The covariance is the inverse of a normal matrix whose parameters have different units:
 
@@ -110,6 +110,16 @@ def squares(planes: NDArray[Any], edge: int) -> NDArray[Any]:
     rows, columns = (n // edge for n in planes.shape[-2:])
     cut = planes[..., : rows * edge, : columns * edge]
     return cut.reshape(*planes.shape[:-2], rows, edge, columns, edge)
+
+
+def cut(plane: Any, top: int, left: int, size: tuple[int, int]) -> Any:
+    """A window of a plane [y, x]; its pixels outside the plane are 0."""
+    out = np.zeros(size, plane.dtype)
+    low_y, high_y = (min(max(at, 0), plane.shape[0]) for at in (top, top + size[0]))
+    low_x, high_x = (min(max(at, 0), plane.shape[1]) for at in (left, left + size[1]))
+    if low_y < high_y and low_x < high_x:
+        out[low_y - top : high_y - top, low_x - left : high_x - left] = plane[low_y:high_y, low_x:high_x]
+    return out
 
 
 def scaled_inverse(normal: Matrix, *, weakest: float = WEAKEST_DIRECTION) -> Matrix:

@@ -42,11 +42,7 @@ def evaluation_png(
     bands: Any = figure.subfigures(rows, 1)
     *slices, by_centre = bands[0].subplots(1, 4)
     shown = shown_slices(evaluation, _SLICES)
-    for axes, frame in zip(slices, shown, strict=False):
-        draw_slices(axes, frame)
-        boxed_legend(axes, 8.5, "upper center")
-    for axes in slices[len(shown) :]:
-        axes.set_visible(False)
+    draw_slices(slices, shown, 8.5)
     draw_centres(by_centre, evaluation.frames)
     draw_maps(bands[1], list(bands[1].subplots(1, 4)), evaluation.superposed)
     frames, lines = evaluation.frames, bands[2].subplots(1, 4)
@@ -86,7 +82,16 @@ def shown_slices(evaluation: Evaluation, most: int) -> list[FrameEvaluation]:
     return [frames[len(frames) // 2] for frames in by_fov][:most]
 
 
-def draw_slices(axes: Any, frame: FrameEvaluation) -> None:
+def draw_slices(charts: Sequence[Any], frames: Sequence[FrameEvaluation], letters: float) -> None:
+    """Draw the slices of each image on a chart, with a legend whose letters have this size. Hide the charts that are left."""
+    for axes, frame in zip(charts, frames, strict=False):
+        _draw_slices(axes, frame)
+        boxed_legend(axes, letters, "upper center")
+    for axes in charts[len(frames) :]:
+        axes.set_visible(False)
+
+
+def _draw_slices(axes: Any, frame: FrameEvaluation) -> None:
     """Draw the observed and simulated intensity along x (circles, solid line) and along y (squares, dashed line)."""
     assert frame.along_x is not None and frame.along_y is not None
     dark = frame.along_x.dark

@@ -224,10 +224,10 @@ def source_centre(
     scatter = float(1.4826 * np.median(np.abs(values - middle)))  # from the median absolute deviation
     peak = float(values.max())
     if not peak > middle + _FLARE_SIGMA * scatter:
-        wanted = f"a spot at least {_FLARE_SIGMA:g} times the scatter ({scatter:.3g}) above the median ({middle:.3g})"
         raise DataError(
             "no-flare",
-            f"expected a flare, {wanted}; got {peak:.3g} at the brightest pixel: give its centre, or use another image",
+            f"expected a flare, a spot at least {_FLARE_SIGMA:g} times the scatter ({scatter:.3g}) above the median "
+            f"({middle:.3g}); got {peak:.3g} at the brightest pixel: give its centre, or use another image",
         )
     brightest = np.unravel_index(int(np.where(usable, smoothed, -np.inf).argmax()), smoothed.shape)
     return (float(brightest[1]), float(brightest[0])), radius

@@ -75,19 +75,19 @@ def _same_unit(flaring: Image, before: Image) -> tuple[Plane, Plane, str]:
     Pixels without a value become 0.
     """
     if flaring.pixels.shape != before.pixels.shape:
-        shapes = f"{flaring.pixels.shape} and {before.pixels.shape}"
         raise DataError(
-            "flare-shapes", f"expected two images of the same shape; got {shapes}: cut both to the same field"
+            "flare-shapes",
+            f"expected two images of the same shape; got {flaring.pixels.shape} and {before.pixels.shape}: cut both to the "
+            "same field",
         )
     rates = [_rate(image) for image in (flaring, before)]
     if flaring.exposure_s is None and before.exposure_s is None and flaring.unit == before.unit:
         rates, unit = [flaring.pixels, before.pixels], unit_label(flaring)
     elif rates[0] is None or rates[1] is None:
-        exposures = f"{flaring.exposure_s} and {before.exposure_s} s"
         raise DataError(
             "flare-units",
-            f"expected the exposure time of both images or of neither; got {exposures}: add XPOSURE to the header "
-            "without it",
+            f"expected the exposure time of both images or of neither; got {flaring.exposure_s} and {before.exposure_s} s: "
+            "add XPOSURE to the header without it",
         )
     else:
         unit = rate_label(flaring)

@@ -209,11 +209,7 @@ def slices_png(evaluation: Evaluation) -> bytes:
     across = min(len(shown), 3)
     rows = -(-len(shown) // across)
     figure, charts = _figure(WIDTH_IN * max(across, 2) / 3, 3.3 * rows, across, rows)
-    for axes, frame in zip(charts, shown, strict=False):
-        draw_slices(axes, frame)
-        boxed_legend(axes, 7, "upper center")
-    for axes in charts[len(shown) :]:
-        axes.set_visible(False)
+    draw_slices(charts, shown, 7)
     return _tidy_png(figure, charts)
 
 

@@ -421,9 +421,8 @@ def _check_determined(normal: Matrix, shape: Shape) -> None:
         )
     weakest = float(np.linalg.eigvalsh(normal / np.outer(diagonal, diagonal))[0])
     if weakest < WEAKEST_DIRECTION:
-        names = ", ".join(shape.names)
         raise DataError(
             "transit-says-too-little",
-            f"expected frames that determine {names}; got frames that leave a combination of them undetermined; "
+            f"expected frames that determine {', '.join(shape.names)}; got frames that leave a combination of them undetermined; "
             "add images at other distances from the limb, or fit a shape with fewer parameters",
         )

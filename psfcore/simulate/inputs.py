@@ -251,8 +251,10 @@ def scenes_from_files(files: Sequence[Path], plan: Plan, limits: FitsLimits) -> 
     if not files:
         return None
     if len(files) not in (1, len(plan.views)):
-        message = f"expected one scene image, or {len(plan.views)} (one for each pointing); got {len(files)}"
-        raise DataError("scene-count", message)
+        raise DataError(
+            "scene-count",
+            f"expected one scene image, or {len(plan.views)} (one for each pointing); got {len(files)}",
+        )
     scenes = {}
     for pointing in plan.pointings:
         rate = image_rate(files[(pointing - 1) % len(files)], limits)

@@ -320,9 +320,10 @@ def read_sky(folder: str | Path, *, threads: int = 1) -> TrueSky:
     except (OSError, ValueError, KeyError, TypeError) as error:
         if isinstance(error, DataError):
             raise
-        expected = f"{TRUTH_FILE} in {folder.name}, as `heliopsf simulate transit` writes it"
         raise DataError(
-            "not-simulated", f"expected a file {expected}; got {type(error).__name__}: {error!s:.120}"
+            "not-simulated",
+            f"expected a file {TRUTH_FILE} in {folder.name}, as `heliopsf simulate transit` writes it; got "
+            f"{type(error).__name__}: {error!s:.120}",
         ) from None
     plan = plan_from_json(plan_json)
     limits = FitsLimits(max_pixels=_LARGEST_PX**2)

@@ -112,8 +112,7 @@ class FoldFit:
     @staticmethod
     def from_json(content: dict[str, Any]) -> FoldFit:
         """The fit from the values of `to_json`."""
-        fit: FoldFit = _FOLD_FIT.validate_python(content)
-        return fit
+        return _FOLD_FIT.validate_python(content)
 
 
 _FOLD_FIT = TypeAdapter(FoldFit)
