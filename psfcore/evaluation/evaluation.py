@@ -225,17 +225,18 @@ def superposed(pe_pct: Plane, noise_pct: Plane) -> Superposed:
         mape_pct=mape,
         noise_mpe_pct=noise_mpe,
         noise_mape_pct=noise_mape,
-        mpe_rms_pct=_rms(mpe),
+        mpe_rms_pct=rms(mpe),
         mpe_largest_pct=float(np.nanmax(np.abs(mpe))),
-        mpe_noise_rms_pct=_rms(noise_mpe),
+        mpe_noise_rms_pct=rms(noise_mpe),
         mape_mean_pct=float(np.nanmean(mape)),
         mape_largest_pct=float(np.nanmax(mape)),
         mape_noise_mean_pct=float(np.nanmean(noise_mape)),
     )
 
 
-def _rms(values: Plane) -> float:
-    return float(np.sqrt(np.nanmean(values**2)))
+def rms(values: Plane | Vector) -> float:
+    """The root mean square of the values that are not nan; nan if there is no value."""
+    return float(np.sqrt(np.nanmean(values**2))) if values.size else math.nan
 
 
 # --- the evaluation ---------------------------------------------------------------------------------------

@@ -25,7 +25,7 @@ from typing import Any, Literal
 import numpy as np
 
 from psfcore.arrays import Vector, json_attributes, json_values
-from psfcore.evaluation.evaluation import Evaluation, FrameEvaluation, Slice, Superposed
+from psfcore.evaluation.evaluation import Evaluation, FrameEvaluation, Slice, Superposed, rms
 from psfcore.scatter.validation.robustness import DarkOffsetStudy
 
 SCHEMA = "evaluation/1"
@@ -106,16 +106,16 @@ def summary_of(frames: Sequence[FrameEvaluation], fov: int | None) -> Summary:
         fov=fov,
         images=len(frames),
         mean_pct=float(residual.mean()),
-        mean_noise_pct=_rms(noise) / math.sqrt(len(frames)),
-        rms_pct=_rms(residual),
-        noise_pct=_rms(noise),
-        gap_pct=math.sqrt(max(_rms(residual) ** 2 - _rms(noise) ** 2, 0.0)),
+        mean_noise_pct=rms(noise) / math.sqrt(len(frames)),
+        rms_pct=rms(residual),
+        noise_pct=rms(noise),
+        gap_pct=math.sqrt(max(rms(residual) ** 2 - rms(noise) ** 2, 0.0)),
         largest_pct=float(np.abs(residual).max()),
         mean_dn_s=float(error.mean()),
-        rms_dn_s=_rms(error),
+        rms_dn_s=rms(error),
         centre_mean_pct=float(centre[there].mean()) if there.any() else math.nan,
-        centre_rms_pct=_rms(centre[there]),
-        centre_noise_pct=_rms(centre_noise[there]),
+        centre_rms_pct=rms(centre[there]),
+        centre_noise_pct=rms(centre_noise[there]),
     )
 
 
@@ -150,10 +150,6 @@ def slope_of(where_px: Vector, error: Vector, noise: Vector) -> Slope:
 def each(frames: Sequence[FrameEvaluation], name: str) -> Vector:
     """An attribute of every image."""
     return np.array([getattr(frame, name) for frame in frames], dtype=np.float64)
-
-
-def _rms(values: Vector) -> float:
-    return float(np.sqrt(np.mean(values**2))) if values.size else math.nan
 
 
 # --- as JSON ----------------------------------------------------------------------------------------------

@@ -64,13 +64,12 @@ _NEAR_ORDERS = 6  # the first fit uses at least this number of orders on each si
 
 @dataclass(frozen=True)
 class Peak:
-    """One diffraction order: index of its arm, order k, fitted position (px). significance: amplitude / error."""
+    """One diffraction order: index of its arm, order k, fitted position (px)."""
 
     arm: int
     order: int
     x_px: float
     y_px: float
-    significance: float
 
 
 @dataclass(frozen=True)
@@ -148,10 +147,9 @@ def _measurement(
     by_angle = np.argsort(angles)
     place = np.argsort(by_angle)
     x, y = order_positions(geometry.centre, state.pattern, orders.arm, orders.k)
-    significance = state.amplitude / result.error[arms + 1 :]
     peaks = tuple(
-        Peak(int(place[arm]), int(k), float(px), float(py), float(s))
-        for arm, k, px, py, s in zip(orders.arm, orders.k, x, y, significance, strict=True)
+        Peak(int(place[arm]), int(k), float(px), float(py))
+        for arm, k, px, py in zip(orders.arm, orders.k, x, y, strict=True)
     )
     model, fitted = np.zeros(halo.shape), np.zeros(halo.shape, dtype=bool)
     model[orders.row, orders.column] = result.light + halo[orders.row, orders.column]

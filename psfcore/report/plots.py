@@ -92,8 +92,13 @@ def _draw_spread(axes: Any, report: PsfReport, name: str) -> None:
         draw_band(axes, *found, _BAND, "folds: median, 1 and 2 sigma")
     axes.axhline(0, color="#555555", linewidth=1.0)
     shown = np.searchsorted(radii, [r for r in RADII_PX if r < radii[-1]])
-    style = {"label": "fit to all images, ±1 σ", **points(_COLOURS[name], 3.0)}
-    axes.errorbar(radii[shown], np.zeros(shown.size), sigma[shown], **style)
+    axes.errorbar(
+        radii[shown],
+        np.zeros(shown.size),
+        sigma[shown],
+        label="fit to all images, ±1 σ",
+        **points(_COLOURS[name], 3.0),
+    )
     axes.set(ylabel="Difference from the fit (points)")
     along_distance(axes, max(report.transit.shape), "Distance R (px)")
 
@@ -165,8 +170,14 @@ def profile_png(report: PsfReport) -> bytes:
         lit = weight > 0
         sigma = np.array(profile["sigma"].get(name, np.zeros(weight.size)))[lit]
         at, mean = np.maximum(radius, NEAREST_PX)[lit], weight[lit]
-        shade: dict[str, Any] = {"color": _COLOURS[name], "alpha": 0.3, "linewidth": 0}
-        axes.fill_between(at, np.maximum(mean - sigma, 0.05 * mean), mean + sigma, **shade)
+        axes.fill_between(
+            at,
+            np.maximum(mean - sigma, 0.05 * mean),
+            mean + sigma,
+            color=_COLOURS[name],
+            alpha=0.3,
+            linewidth=0,
+        )
         axes.plot(at, mean, color=_COLOURS[name], linewidth=1.5, label=_NAMES[name])
         if name != DIFFRACTION:
             lowest.append(float(mean[radius[lit] < FARTHEST_PX].min()))
@@ -195,8 +206,14 @@ def totals_png(cross: CrossValidated, fit: TransitFit) -> bytes:
     """Histogram of the total diffuse scatter over the folds."""
     figure, (axes,) = _figure(6.4, 3.4, 1)
     total, sigma = 100 * fit.inversion.values["total"], 100 * fit.value_sigma["total"]
-    style: dict[str, Any] = {"color": _COLOURS[SCATTER], "alpha": 0.2, "linewidth": 0}
-    axes.axvspan(total - sigma, total + sigma, label="error of that fit, ±1 σ", **style)
+    axes.axvspan(
+        total - sigma,
+        total + sigma,
+        color=_COLOURS[SCATTER],
+        alpha=0.2,
+        linewidth=0,
+        label="error of that fit, ±1 σ",
+    )
     draw_totals(axes, cross.bands.totals, _BAND)
     axes.axvline(total, color=_COLOURS[SCATTER], linewidth=1.6, label="fit to all images")
     legend(axes, loc="best")
@@ -232,8 +249,7 @@ def residuals_png(evaluation: Evaluation) -> bytes:
             axes.set(xlabel=label if row else "")
         charts[3 * row].set_ylabel(f"{name}: residual (%)")
     labelled = charts[0].get_legend_handles_labels()
-    style: dict[str, Any] = {"ncols": 8, "fontsize": 9, "frameon": False}
-    figure.legend(*labelled, title="pointing", loc="outside upper center", **style)
+    figure.legend(*labelled, title="pointing", loc="outside upper center", ncols=8, fontsize=9, frameon=False)
     return _tidy_png(figure, charts)
 
 

@@ -77,13 +77,12 @@ def draw_residuals(figure: Any, report: Report) -> None:
     for axes, (label, at) in zip(charts, along, strict=True):
         axes.axhline(0, color="#555555", linewidth=1.0)
         for here, colour, symbol in looks.values():
-            style: dict[str, Any] = {"fmt": symbol, "color": colour}
             for what, more in (
                 ("", {"ms": 5, "elinewidth": 1.1, "mew": 0}),
                 ("after_", {"ms": 4.5, "elinewidth": 0.5, **hollow}),
             ):
                 residual, noise = (_column(rows, f"{name}_{what}pct") for name in ("residual", "noise"))
-                axes.errorbar(at[here], residual[here], noise[here], **style, **more)
+                axes.errorbar(at[here], residual[here], noise[here], fmt=symbol, color=colour, **more)
         axes.set(xlabel=label)
     charts[0].set(ylabel="Simulated - observed (%)")
     entries: list[dict[str, Any]] = [
@@ -123,8 +122,18 @@ def draw_map(figure: Any, report: Report) -> None:
     for axes, values in zip(charts, (before, _column(rows, "residual_after_pct")), strict=False):
         for fov, (here, _, symbol) in _looks(rows).items():
             here = here & np.isfinite(values)
-            style = {"marker": symbol, "s": 62, "edgecolors": "#444444", "linewidths": 0.6}
-            drawn = axes.scatter(x[here], y[here], c=values[here], cmap=CHANGE, vmin=-top, vmax=top, **style)
+            drawn = axes.scatter(
+                x[here],
+                y[here],
+                s=62,
+                c=values[here],
+                marker=symbol,
+                cmap=CHANGE,
+                vmin=-top,
+                vmax=top,
+                edgecolors="#444444",
+                linewidths=0.6,
+            )
             axes.plot([], [], symbol, color="#777777", ms=7, label=f"pointing {fov}")
         axes.set(xlim=(-0.5, nx - 0.5), ylim=(-0.5, ny - 0.5), aspect="equal", xlabel="Detector x (px)")
     charts[0].set(ylabel="Detector y (px)")
@@ -194,9 +203,16 @@ def draw_cells(figure: Any, found: Diagnosis) -> None:
             colour = CHANGE((share + 1) / 2)
             axes.add_patch(Wedge((0, 0), high, *ends, width=high - low, fc=colour, ec="white", lw=1.0))
             angle, middle = np.radians(sector * 360 / sectors), (low + high) / 2 if low else 0.0
-            style = {"color": "white" if abs(share) > _DARK else INK, "fontsize": 8, "linespacing": 1.05}
-            place = middle * np.cos(angle), middle * np.sin(angle)
-            axes.text(*place, f"{mean:+.1f}\n±{error:.1f}", ha="center", va="center", **style)
+            axes.text(
+                middle * np.cos(angle),
+                middle * np.sin(angle),
+                f"{mean:+.1f}\n±{error:.1f}",
+                ha="center",
+                va="center",
+                color="white" if abs(share) > _DARK else INK,
+                fontsize=8,
+                linespacing=1.05,
+            )
         axes.add_patch(Circle((0, 0), 1.0, fc="none", ec="#555555", lw=1.0))
         axes.set(
             xlim=(-1.05, 1.05),
