@@ -42,9 +42,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.arrays import cut
 from psfcore.compiled import compiled
 from psfcore.errors import DataError
-from psfcore.psf import REACH_GRID_PX, crop_or_pad, squared_radii
+from psfcore.psf import REACH_GRID_PX, squared_radii
 
 # This radius is slightly larger than 1448.15 px, the distance of the corner of the reach grid from its centre.
 FULL_REACH_PX = 1449.0
@@ -110,7 +111,8 @@ class Segments:
 
         The value is -1 at the centre, outside all shells, and outside the reach grid.
         """
-        return np.asarray(crop_or_pad(self._reach_map + 1.0, size) - 1, dtype=np.int32)
+        first = self.reach_grid_px // 2 - size // 2
+        return np.asarray(cut(self._reach_map + 1, first, first, (size, size)) - 1)
 
     def mean_of_map(self, kernel: Floats) -> Floats:
         """psf_S of Eq. (2) for any kernel [y, x] on the reach grid, array (size,). It is 0 for empty segments."""

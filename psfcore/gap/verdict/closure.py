@@ -155,7 +155,7 @@ def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold])
         spread[tuple(held)] = _spread(along[:, :cells]), _spread(along)
     if not rows:
         return None
-    return HeldOut(tuple(images), *np.array(rows).T, deviance=deviance, spread=spread)
+    return HeldOut(tuple(images), *np.array(rows).T, deviance, spread)
 
 
 def _error(jacobian: Vector, covariance: Vector) -> float:
