@@ -155,7 +155,10 @@ def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold])
         spread[tuple(held)] = _spread(along[:, :cells]), _spread(along)
     if not rows:
         return None
-    return HeldOut(tuple(images), *np.array(rows).T, deviance, spread)
+    chi2, of_cells, blocks_chi2, of_blocks, residual, noise_pct = np.array(rows).T
+    return HeldOut(
+        tuple(images), chi2, of_cells, blocks_chi2, of_blocks, residual, noise_pct, deviance, spread
+    )
 
 
 def _error(jacobian: Vector, covariance: Vector) -> float:
