@@ -125,13 +125,12 @@ def _of_transit(
     manifest: TransitManifest, content: Mapping[str, Any], folder: Path, limits: FitsLimits
 ) -> Plan:
     """The plan of a transit whose images may not be taken yet."""
-    there = [(folder / image.file).is_file() for image in manifest.images]
-    if any(there) and not all(there):
-        missing = [image.file for image, is_there in zip(manifest.images, there, strict=True) if not is_there]
+    missing = [image.file for image in manifest.images if not (folder / image.file).is_file()]
+    if 0 < len(missing) < len(manifest.images):
         raise _bad(
             f"{MANIFEST_NAME}: expected all images in the folder, or none of them; missing: {', '.join(missing[:5])}"
         )
-    if all(there):
+    if not missing:
         headers = [read_summary(folder / image.file, limits) for image in manifest.images]
         size_px, exposures = _size_of_headers(headers), _exposures_of_headers(headers, manifest)
     else:
