@@ -1,4 +1,4 @@
-"""Arrays of results: their JSON values, their hashes, the differences between two of them, and the covariance of a fit.
+"""Arrays of numbers: their kinds, windows and squares, their JSON values and hashes, differences, and the covariance of a fit.
 
 The covariance is the inverse of a normal matrix whose parameters have different units:
 
@@ -26,7 +26,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Matrix = NDArray[np.float64]
+Vector = NDArray[np.float64]  # (n,)
+Matrix = NDArray[np.float64]  # (rows, columns), or more axes
+Plane = NDArray[np.float64]  # [y, x] of an image
+Kernel = NDArray[np.float64]  # weights [y, x] of a PSF, with the centre at [ny // 2, nx // 2]
+Flags = NDArray[np.bool_]
 
 # Share of B's largest eigenvalue: a direction whose eigenvalue is smaller is undetermined.
 WEAKEST_DIRECTION = 1e-15
@@ -96,6 +100,26 @@ def array_sha256(array: NDArray[Any]) -> str:
     """
     plain = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
     return hashlib.sha256(plain.tobytes()).hexdigest()
+
+
+def squares(planes: NDArray[Any], edge: int) -> NDArray[Any]:
+    """Planes [..., y, x], divided into squares of `edge` px: (..., rows, edge, columns, edge).
+
+    Incomplete squares in the last rows and columns are left out.
+    """
+    rows, columns = (n // edge for n in planes.shape[-2:])
+    cut = planes[..., : rows * edge, : columns * edge]
+    return cut.reshape(*planes.shape[:-2], rows, edge, columns, edge)
+
+
+def cut(plane: Any, top: int, left: int, size: tuple[int, int]) -> Any:
+    """A window of a plane [y, x]; its pixels outside the plane are 0."""
+    out = np.zeros(size, plane.dtype)
+    low_y, high_y = (min(max(at, 0), plane.shape[0]) for at in (top, top + size[0]))
+    low_x, high_x = (min(max(at, 0), plane.shape[1]) for at in (left, left + size[1]))
+    if low_y < high_y and low_x < high_x:
+        out[low_y - top : high_y - top, low_x - left : high_x - left] = plane[low_y:high_y, low_x:high_x]
+    return out
 
 
 def scaled_inverse(normal: Matrix, *, weakest: float = WEAKEST_DIRECTION) -> Matrix:

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from psfcore.arrays import cut
 from psfcore.errors import DataError
 from psfcore.instruments.files import PLATE_SCALE_TOLERANCE as PLATE_SCALE_TOLERANCE
 from psfcore.recipe import REACH_GRID_PX as REACH_GRID_PX
@@ -202,14 +203,8 @@ def central_part(psf: Psf, size_px: int) -> Psf:
 
 def crop_or_pad(kernel: Kernel, size: int) -> Kernel:
     """Crop a kernel, or pad it with zeros, to (size, size); the new centre is at [size // 2, size // 2]."""
-    if kernel.shape[0] >= size and kernel.shape[1] >= size:
-        return crop_centred(kernel, (size, size))
-    out = np.zeros((size, size))
-    ny, nx = (min(n, size) for n in kernel.shape)
-    part = crop_centred(kernel, (ny, nx))
-    top, left = size // 2 - ny // 2, size // 2 - nx // 2
-    out[top : top + ny, left : left + nx] = part
-    return out
+    top, left = (n // 2 - size // 2 for n in kernel.shape)
+    return np.asarray(cut(kernel, top, left, (size, size)))
 
 
 def squared_radii(shape: tuple[int, int]) -> NDArray[np.int64]:

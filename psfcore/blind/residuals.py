@@ -18,10 +18,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.arrays import Kernel, Vector
 from psfcore.noise import Noise
 from psfcore.scatter.inversion import invert
 from psfcore.scatter.reconstruction import DARK_MARGIN_PX, Reconstruction, TransitScenes
-from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Kernel, Vector
+from psfcore.scatter.shapes import SOFTENED_POWER_LAW
 from psfcore.scatter.total_psf import Blur, Optics, TotalPsf
 from psfcore.simulate.scatter_truth import ScatterTruth
 from psfcore.transit.occulter import fully_dark

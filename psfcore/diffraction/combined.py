@@ -22,15 +22,16 @@ One rule decides how each component of the entrance is computed, and the provena
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.arrays import Kernel
 from psfcore.convolution.convolver import linear_convolve
-from psfcore.diffraction.fraunhofer import far_field, samples_per_pixel
+from psfcore.diffraction.fraunhofer import Progress, far_field, samples_per_pixel
 from psfcore.diffraction.mesh_series import (
     hexagonal_mesh_kernel,
     mesh_line,
@@ -45,9 +46,6 @@ from psfcore.instruments.workload import MOST_MASK_SAMPLES, PERIOD_PX, windows_o
 STEPS_A_PUPIL = 20  # steps of progress for each component
 AIRY, ENTRANCE_MESH, MOUNT, ENTRANCE = "AIRY", "ENTRANCE_MESH", "MOUNT", "ENTRANCE"
 FILTER_WHEEL, DIFFRACTION = "FILTER_WHEEL", "DIFFRACTION"
-
-Kernel = NDArray[np.float64]
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)

@@ -107,8 +107,10 @@ def _check(pitches: Sequence[float], wires: Sequence[float]) -> None:
             "bad-design", f"expected 1 to {MOST_MESHES} meshes (pitches times wires); got {number}"
         )
     if not (wires[0] > 0 and np.isfinite(pitches).all() and wires[-1] < pitches[0]):
-        expected = "finite pitches and wires with 0 < wire < pitch (um)"
-        raise DataError("bad-design", f"expected {expected}; got wires {wires} and pitches {pitches}")
+        raise DataError(
+            "bad-design",
+            f"expected finite pitches and wires with 0 < wire < pitch (um); got wires {wires} and pitches {pitches}",
+        )
 
 
 def _mesh(

@@ -41,6 +41,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from psfcore.arrays import Vector
 from psfcore.convolution.convolver import ChirpTransform
 from psfcore.errors import DataError
 from psfcore.instruments.model import MM_PER_UM, Mesh, Mirror
@@ -49,7 +50,6 @@ SAMPLING_MARGIN = 1.5
 MOST_SAMPLES = 8_000_000
 
 Wave = NDArray[np.complex128]
-Vector = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

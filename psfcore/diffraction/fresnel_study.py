@@ -32,12 +32,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.arrays import Vector, json_attributes
 from psfcore.convolution.convolver import linear_convolve
 from psfcore.diffraction.fresnel import (
     SAMPLING_MARGIN,
     FresnelStep,
     Grid,
-    Vector,
     Wave,
     binned_light,
     fraunhofer_field,
@@ -330,13 +330,11 @@ def _distance_json(result: DistanceResult, kept: NDArray[np.int64]) -> dict[str,
         "phase_lowest_points",
         "phase_highest_points",
     )
-    numbers = ("distance_mm", "beam_mm", "beam_pitches", "wheel_order_spacing_px")
     return {
-        **{name: getattr(result, name) for name in numbers},
-        "sampling": [asdict(plane) for plane in result.sampling],
-        "largest_points": result.largest_points,
-        "largest_single_points": result.largest_single_points,
-        "phase_largest_points": result.phase_largest_points.tolist(),
+        **json_attributes(result, "distance_mm", "beam_mm", "beam_pitches", "wheel_order_spacing_px"),
+        **json_attributes(
+            result, "sampling", "largest_points", "largest_single_points", "phase_largest_points"
+        ),
         **{name: getattr(result, name)[near].tolist() for name in lines},
         **{name: getattr(result, name)[kept].tolist() for name in curves},
     }

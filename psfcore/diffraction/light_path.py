@@ -33,10 +33,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from psfcore.arrays import Vector
 from psfcore.diffraction.fresnel import (
     FresnelStep,
     Grid,
-    Vector,
     Wave,
     binned_light,
     common_openings_mm,
@@ -181,27 +181,30 @@ def light_path(instrument: Instrument) -> LightPath:
     Raises DataError "bad-instrument-file"; the message names the missing or unsuitable key.
     """
     distances = instrument.distances
-    meshes = [mesh for place in _PLACES for mesh in instrument.meshes if mesh.place == place]
+    meshes = {place: [m for m in instrument.meshes if m.place == place] for place in _PLACES}
     if len(instrument.mirrors) != 2:
-        got = f"{len(instrument.mirrors)} mirrors"
-        raise _lacking(instrument, "mirrors", "a primary and a secondary", got)
+        raise _lacking(
+            instrument, "mirrors", "a primary and a secondary", f"{len(instrument.mirrors)} mirrors"
+        )
     if distances is None:
         raise _lacking(instrument, "distances", "the distances along the optical path", "none")
-    for place in _PLACES:
-        count = sum(mesh.place == place for mesh in meshes)
-        if count != 1:
-            raise _lacking(instrument, "meshes", f"one mesh at place {place!r}", str(count))
+    for place, there in meshes.items():
+        if len(there) != 1:
+            raise _lacking(instrument, "meshes", f"one mesh at place {place!r}", str(len(there)))
     if not instrument.aperture.round:
         raise _lacking(instrument, "aperture", "a whole disc or ring", "a sector or a polygon")
-    entrance, wheel = meshes
+    (entrance,), (wheel,) = meshes.values()
     if "hexagonal" in (entrance.openings, wheel.openings):
         raise _lacking(
             instrument, "meshes.openings", "square meshes, for propagation in one dimension", "hexagonal"
         )
     if (entrance.angle_deg - wheel.angle_deg) % 90:
-        expected = "meshes with the same axes, for propagation in one dimension"
-        got = f"{entrance.angle_deg:g} and {wheel.angle_deg:g} degrees"
-        raise _lacking(instrument, "meshes.angle_deg", expected, got)
+        raise _lacking(
+            instrument,
+            "meshes.angle_deg",
+            "meshes with the same axes, for propagation in one dimension",
+            f"{entrance.angle_deg:g} and {wheel.angle_deg:g} degrees",
+        )
     return LightPath(
         wavelength_mm=instrument.wavelength_angstrom * MM_PER_ANGSTROM,
         aperture=instrument.aperture,

@@ -44,10 +44,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import cumulative_simpson
 from scipy.special import j0, j1
 
+from psfcore.arrays import Kernel, Vector
 from psfcore.compiled import compiled
 from psfcore.instruments.model import MM_PER_ANGSTROM, MM_PER_UM, UM_PER_MM, Aperture, signed_area
 from psfcore.instruments.workload import AIRY_STEP
@@ -57,10 +57,8 @@ NEAR_PX = 24
 NEAR_POINTS, FAR_POINTS = 48, 16
 RAYS_A_TURN = 65_536  # lines for a whole circle: seven in each pixel at 1448 px
 
-Vector = NDArray[np.float64]
 
-
-def airy_light_beyond(v: NDArray[np.float64], obscured: float = 0.0) -> NDArray[np.float64]:
+def airy_light_beyond(v: Vector, obscured: float = 0.0) -> Vector:
     """Return B of Eq. (2) at each v. v must ascend from 0 in equal steps; `obscured` is e."""
     if obscured == 0:
         return np.asarray(j0(v) ** 2 + j1(v) ** 2)
@@ -69,7 +67,7 @@ def airy_light_beyond(v: NDArray[np.float64], obscured: float = 0.0) -> NDArray[
     return np.asarray(1 - inside)
 
 
-def _jinc(v: NDArray[np.float64]) -> NDArray[np.float64]:
+def _jinc(v: Vector) -> Vector:
     return np.asarray(np.divide(2 * j1(v), v, out=np.ones_like(v), where=v > 0))
 
 
@@ -81,7 +79,7 @@ def airy_kernel(
     pixel_pitch_um: float,
     size: int,
     obscuration_diameter_mm: float = 0.0,
-) -> NDArray[np.float64]:
+) -> Kernel:
     """The share of all light in each pixel, shape (size, size), centre at [size // 2, size // 2]; size must be even.
 
     The kernel is not normalised: its sum is below 1, because light falls outside the array.
@@ -131,7 +129,7 @@ def edge_kernel(
     focal_length_mm: float,
     pixel_pitch_um: float,
     size: int,
-) -> NDArray[np.float64]:
+) -> Kernel:
     """The share of all light in each pixel, shape (size, size), centre at [size // 2, size // 2].
 
     The sum is below 1, because light falls outside the array. Beside the exact patterns of pupils that need 36 to 88

@@ -172,5 +172,4 @@ def _panel(axes: Any, study: DesignStudy, value: _Number) -> None:
     axes.xaxis.set_minor_locator(NullLocator())
     axes.set_ylim(bottom=0)
     axes.grid(which="major", color="#dddddd", linewidth=0.7)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    axes.spines[["top", "right"]].set_visible(False)

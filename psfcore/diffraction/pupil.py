@@ -137,29 +137,37 @@ def _mount_outlines(mount: Mount, rim_mm: float) -> list[Outline]:
     outlines: list[Outline] = []
     hub_mm = mount.hub_diameter_mm / 2
     if hub_mm >= rim_mm:
-        expected = f"mount.hub_diameter_mm: expected less than the aperture's {2 * rim_mm:g} mm"
-        raise DataError("bad-mount", f"{expected}; got {mount.hub_diameter_mm:g}")
+        raise _bad_mount(
+            "hub_diameter_mm", f"less than the aperture's {2 * rim_mm:g} mm", f"{mount.hub_diameter_mm:g}"
+        )
     if hub_mm > 0:
         outlines.append((circle(hub_mm),))
     for index, rays in enumerate(mount.rays):
         if rays.width_mm >= 2 * rim_mm:
-            expected = f"mount.rays.{index}.width_mm: expected less than the aperture's {2 * rim_mm:g} mm"
-            raise DataError("bad-mount", f"{expected}; got {rays.width_mm:g}")
+            raise _bad_mount(
+                f"rays.{index}.width_mm", f"less than the aperture's {2 * rim_mm:g} mm", f"{rays.width_mm:g}"
+            )
         for ray in range(rays.count):
             angle_deg = rays.first_angle_deg + 360 * ray / rays.count
             outlines.append((bar(0.0, 2 * rim_mm, rays.width_mm, angle_deg),))
     for index, ring in enumerate(mount.rings):
         inner_mm, outer_mm = ring.radius_mm - ring.width_mm / 2, ring.radius_mm + ring.width_mm / 2
         if inner_mm < 0 or outer_mm > rim_mm + _RIM_TOLERANCE_MM:
-            expected = f"mount.rings.{index}: expected a ring within the aperture's radius {rim_mm:g} mm"
-            raise DataError("bad-mount", f"{expected}; got {inner_mm:g} to {outer_mm:g} mm")
+            raise _bad_mount(
+                f"rings.{index}",
+                f"a ring within the aperture's radius {rim_mm:g} mm",
+                f"{inner_mm:g} to {outer_mm:g} mm",
+            )
         hole = (circle(inner_mm)[::-1],) if inner_mm > 0 else ()
         outlines.append((circle(outer_mm), *hole))
     for index, polygon in enumerate(mount.polygons):
         corners = np.array(polygon.corners_mm, dtype=np.float64)
         if np.abs(corners).max() > _FARTHEST_CORNER * 2 * rim_mm:
-            expected = f"mount.polygons.{index}: expected corners within {_FARTHEST_CORNER} diameters of the aperture"
-            raise DataError("bad-mount", f"{expected}; got a corner at {np.abs(corners).max():g} mm")
+            raise _bad_mount(
+                f"polygons.{index}",
+                f"corners within {_FARTHEST_CORNER} diameters of the aperture",
+                f"a corner at {np.abs(corners).max():g} mm",
+            )
         outlines.append((corners,))
     return outlines
 
@@ -167,22 +175,25 @@ def _mount_outlines(mount: Mount, rim_mm: float) -> list[Outline]:
 def _mask_picture(
     described: MaskImage, pixels: NDArray[np.floating] | None, aperture: Aperture
 ) -> MaskPicture:
-    key = "mount.mask_image"
+    key = "mask_image"
     if pixels is None:
-        raise DataError(
-            "bad-mount", f"{key}: expected the pixels of {described.file}; got none: give them as mount_image"
-        )
+        raise _bad_mount(key, f"the pixels of {described.file}", "none: give them as mount_image")
     if pixels.ndim != 2 or pixels.shape[0] != pixels.shape[1] or pixels.size == 0:
-        raise DataError(
-            "bad-mount", f"{key}: expected a square image with two axes; got shape {pixels.shape}"
-        )
+        raise _bad_mount(key, "a square image with two axes", f"shape {pixels.shape}")
     if not np.isfinite(pixels).all() or pixels.min() < 0 or pixels.max() <= 0:
-        expected = "expected finite values of at least 0 (0 is opaque), some of them above 0 (open)"
-        raise DataError("bad-mount", f"{key}: {expected}; got {pixels.min():g} to {pixels.max():g}")
+        finite = "finite values of at least 0 (0 is opaque), some of them above 0 (open)"
+        raise _bad_mount(key, finite, f"{pixels.min():g} to {pixels.max():g}")
     if described.width_mm < aperture.diameter_mm:
-        expected = f"{key}.width_mm: expected at least the aperture's {aperture.diameter_mm:g} mm"
-        raise DataError("bad-mount", f"{expected}; got {described.width_mm:g}")
+        raise _bad_mount(
+            f"{key}.width_mm",
+            f"at least the aperture's {aperture.diameter_mm:g} mm",
+            f"{described.width_mm:g}",
+        )
     return MaskPicture(np.asarray(pixels, dtype=np.float64) / float(pixels.max()), described.width_mm)
+
+
+def _bad_mount(key: str, expected: str, got: str) -> DataError:
+    return DataError("bad-mount", f"mount.{key}: expected {expected}; got {got}")
 
 
 class MaskGrid:

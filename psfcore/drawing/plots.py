@@ -47,7 +47,7 @@ INK = "#222222"
 
 Plane = NDArray[np.floating]
 Vector = NDArray[np.float64]
-Place = tuple[float, float, float, float]  # left, bottom, width and height, as fractions of the figure
+AxesBounds = tuple[float, float, float, float]  # left, bottom, width and height, as fractions of the figure
 
 NEAREST_PX, FARTHEST_PX = 0.5, REACH_GRID_PX / 2
 POINTINGS = ("#1b4f8a", "#c2402f", "#2b8a6e", "#7b3fa0", "#8a6d00", "#5b5b5b")
@@ -142,7 +142,7 @@ def compared_panels(before: Plane, after: Plane, unit: str) -> list[Panel]:
 
 
 def draw_panels(
-    figure: Figure, panels: Sequence[Panel], places: Sequence[Place], shape: tuple[int, ...]
+    figure: Figure, panels: Sequence[Panel], places: Sequence[AxesBounds], shape: tuple[int, ...]
 ) -> None:
     """Draw panels, three in a row, each with a colour bar. shape: of the image in pixels, for the axes."""
     extent = (-0.5, shape[1] - 0.5, -0.5, shape[0] - 0.5)

@@ -44,14 +44,12 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.arrays import Flags, Kernel, Plane, Vector
 from psfcore.errors import DataError
 from psfcore.scatter.reconstruction import LEAST_DARK_PIXELS, Progress, dark_pixels
-from psfcore.scatter.shapes import Vector
 from psfcore.scatter.total_psf import Optics, Pixels, noise_covariance, pick, put
 from psfcore.transit.occulter import DOUBT_SIGMAS, FoundPlace, find_occulter
-from psfcore.transit.transit import Frame, Kernel, Transit
-
-Map = NDArray[np.float64]
+from psfcore.transit.transit import Frame, Transit
 
 CENTRE_PX = 2.0
 LEAST_SHARE = 0.5  # a position is on the maps if it is dark in at least this fraction of the images
@@ -77,7 +75,7 @@ class Slice:
     offset_px: Vector
     observed: Vector
     simulated: Vector
-    dark: NDArray[np.bool_]
+    dark: Flags
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +150,7 @@ class FrameEvaluation:
         return 100 * self.centre_noise_dn_s / self.observed_dn_s
 
 
-def at_centre(dark: Pixels, found: FoundPlace) -> NDArray[np.bool_]:
+def at_centre(dark: Pixels, found: FoundPlace) -> Flags:
     """The mask of the dark pixels within CENTRE_PX of the centre of the occulter."""
     place = found.place
     return np.asarray(np.hypot(dark[0] - place.y_px, dark[1] - place.x_px) <= CENTRE_PX)
@@ -161,7 +159,7 @@ def at_centre(dark: Pixels, found: FoundPlace) -> NDArray[np.bool_]:
 # --- maps ------------------------------------------------------------------------------------------------
 
 
-def superposed_maps(frames: Sequence[FrameEvaluation], values: Sequence[Vector], half_px: int) -> Map:
+def superposed_maps(frames: Sequence[FrameEvaluation], values: Sequence[Vector], half_px: int) -> Plane:
     """Values of the dark pixels of each image by whole-pixel offset from the centre of its occulter; nan elsewhere.
 
     The result has the shape (images, 2 half_px + 1, 2 half_px + 1).
@@ -183,53 +181,31 @@ class Superposed:
     """Maps [y, x] by offset from the centre of the occulter, which is at [half_px, half_px]; nan outside the disc.
 
     images: number of superposed discs. count: for each position, the number of images in which this pixel is dark.
-    noise_mpe_pct: standard error of the MPE from noise alone. noise_mape_pct: MAPE of noise alone.
+    noise_mpe_pct: standard error of the MPE from noise alone. noise_mape_pct: MAPE of noise alone. mpe_rms_pct,
+    mpe_largest_pct: rms and largest absolute value of the MPE over the map. mape_mean_pct, mape_largest_pct: mean and
+    largest value of the MAPE. mpe_noise_rms_pct, mape_noise_mean_pct: what noise alone gives.
     """
 
     images: int
     count: NDArray[np.int64]
-    mpe_pct: Map
-    mape_pct: Map
-    noise_mpe_pct: Map
-    noise_mape_pct: Map
+    mpe_pct: Plane
+    mape_pct: Plane
+    noise_mpe_pct: Plane
+    noise_mape_pct: Plane
+    mpe_rms_pct: float
+    mpe_largest_pct: float
+    mpe_noise_rms_pct: float
+    mape_mean_pct: float
+    mape_largest_pct: float
+    mape_noise_mean_pct: float
 
     @property
     def half_px(self) -> int:
         """The index of the centre in both axes."""
         return self.count.shape[0] // 2
 
-    @property
-    def mpe_rms_pct(self) -> float:
-        """The rms of the MPE over the map."""
-        return rms(self.mpe_pct)
 
-    @property
-    def mpe_noise_rms_pct(self) -> float:
-        """The expected rms of the MPE from noise alone."""
-        return rms(self.noise_mpe_pct)
-
-    @property
-    def mpe_largest_pct(self) -> float:
-        """The largest |MPE| of the map."""
-        return float(np.nanmax(np.abs(self.mpe_pct)))
-
-    @property
-    def mape_mean_pct(self) -> float:
-        """The mean of the MAPE over the map."""
-        return float(np.nanmean(self.mape_pct))
-
-    @property
-    def mape_noise_mean_pct(self) -> float:
-        """The expected mean of the MAPE from noise alone."""
-        return float(np.nanmean(self.noise_mape_pct))
-
-    @property
-    def mape_largest_pct(self) -> float:
-        """The largest MAPE of the map."""
-        return float(np.nanmax(self.mape_pct))
-
-
-def superposed(pe_pct: Map, noise_pct: Map) -> Superposed:
+def superposed(pe_pct: Plane, noise_pct: Plane) -> Superposed:
     """The maps of Eq. (4), at positions that are dark in at least LEAST_SHARE of the images.
 
     pe_pct: PE of each image, as `superposed_maps` returns it. noise_pct: the same for each noise realisation, with the
@@ -238,20 +214,28 @@ def superposed(pe_pct: Map, noise_pct: Map) -> Superposed:
     count = np.isfinite(pe_pct).sum(axis=0)
     shown = count >= max(LEAST_SHARE * len(pe_pct), 1)
     over, realisations = np.where(shown, count, np.nan), max(len(noise_pct), 1)
-    noise_mpe = np.nansum(noise_pct, axis=1) / over
-    noise_mape = np.nansum(np.abs(noise_pct), axis=1)
+    of_noise = np.nansum(noise_pct, axis=1) / over
+    mpe, mape = np.nansum(pe_pct, axis=0) / over, np.nansum(np.abs(pe_pct), axis=0) / over  # Eq. (4)
+    noise_mpe = np.sqrt(np.sum(of_noise**2, axis=0) / realisations)
+    noise_mape = np.sum(np.nansum(np.abs(noise_pct), axis=1), axis=0) / realisations / over
     return Superposed(
         images=len(pe_pct),
         count=count,
-        mpe_pct=np.nansum(pe_pct, axis=0) / over,  # Eq. (4)
-        mape_pct=np.nansum(np.abs(pe_pct), axis=0) / over,  # Eq. (4)
-        noise_mpe_pct=np.sqrt(np.sum(noise_mpe**2, axis=0) / realisations),
-        noise_mape_pct=np.sum(noise_mape, axis=0) / realisations / over,
+        mpe_pct=mpe,
+        mape_pct=mape,
+        noise_mpe_pct=noise_mpe,
+        noise_mape_pct=noise_mape,
+        mpe_rms_pct=rms(mpe),
+        mpe_largest_pct=float(np.nanmax(np.abs(mpe))),
+        mpe_noise_rms_pct=rms(noise_mpe),
+        mape_mean_pct=float(np.nanmean(mape)),
+        mape_largest_pct=float(np.nanmax(mape)),
+        mape_noise_mean_pct=float(np.nanmean(noise_mape)),
     )
 
 
-def rms(values: Map) -> float:
-    """The root of the mean square of the values that are not nan; nan without any value."""
+def rms(values: Plane | Vector) -> float:
+    """The root mean square of the values that are not nan; nan if there is no value."""
     return float(np.sqrt(np.nanmean(values**2))) if values.size else math.nan
 
 

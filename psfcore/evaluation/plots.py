@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from psfcore.arrays import Vector
 from psfcore.drawing.plots import (
     CHANGE,
     boxed_legend,
@@ -21,7 +22,6 @@ from psfcore.drawing.plots import (
 )
 from psfcore.evaluation.evaluation import Evaluation, FrameEvaluation, Superposed
 from psfcore.evaluation.report import each, sentence
-from psfcore.scatter.shapes import Vector
 from psfcore.scatter.validation.robustness import DarkOffsetStudy
 
 _OBSERVED, _SIMULATED = "#444444", "#c2402f"
@@ -42,11 +42,7 @@ def evaluation_png(
     bands: Any = figure.subfigures(rows, 1)
     *slices, by_centre = bands[0].subplots(1, 4)
     shown = shown_slices(evaluation, _SLICES)
-    for axes, frame in zip(slices, shown, strict=False):
-        draw_slices(axes, frame)
-        boxed_legend(axes, 8.5, "upper center")
-    for axes in slices[len(shown) :]:
-        axes.set_visible(False)
+    draw_slices(slices, shown, 8.5)
     draw_centres(by_centre, evaluation.frames)
     draw_maps(bands[1], list(bands[1].subplots(1, 4)), evaluation.superposed)
     frames, lines = evaluation.frames, bands[2].subplots(1, 4)
@@ -86,7 +82,16 @@ def shown_slices(evaluation: Evaluation, most: int) -> list[FrameEvaluation]:
     return [frames[len(frames) // 2] for frames in by_fov][:most]
 
 
-def draw_slices(axes: Any, frame: FrameEvaluation) -> None:
+def draw_slices(charts: Sequence[Any], frames: Sequence[FrameEvaluation], letters: float) -> None:
+    """Draw the slices of each image on a chart, with a legend whose letters have this size. Hide the charts that are left."""
+    for axes, frame in zip(charts, frames, strict=False):
+        _draw_slices(axes, frame)
+        boxed_legend(axes, letters, "upper center")
+    for axes in charts[len(frames) :]:
+        axes.set_visible(False)
+
+
+def _draw_slices(axes: Any, frame: FrameEvaluation) -> None:
     """Draw the observed and simulated intensity along x (circles, solid line) and along y (squares, dashed line)."""
     assert frame.along_x is not None and frame.along_y is not None
     dark = frame.along_x.dark
@@ -97,10 +102,23 @@ def draw_slices(axes: Any, frame: FrameEvaluation) -> None:
         ("along x", frame.along_x, "o", _OBSERVED, "-", _SIMULATED),
         ("along y", frame.along_y, "s", "#7d9cc0", (0, (4, 2)), "#1b4f8a"),
     ):
-        dots: dict[str, Any] = {"color": face, "markersize": 3.4, "zorder": 2}
-        axes.plot(along.offset_px, along.observed, marker, label=f"observed {name}", **dots)
-        style: dict[str, Any] = {"color": line, "linestyle": dashes, "linewidth": 1.6}
-        axes.plot(along.offset_px, along.simulated, label=f"simulated {name}", **style)
+        axes.plot(
+            along.offset_px,
+            along.observed,
+            marker,
+            color=face,
+            markersize=3.4,
+            zorder=2,
+            label=f"observed {name}",
+        )
+        axes.plot(
+            along.offset_px,
+            along.simulated,
+            color=line,
+            linestyle=dashes,
+            linewidth=1.6,
+            label=f"simulated {name}",
+        )
     # The axis is scaled to the light in the disc, because the light outside may be a hundred times brighter.
     middle = np.concatenate([s.observed[np.abs(s.offset_px) <= 14] for s in (frame.along_x, frame.along_y)])
     inner = np.concatenate([s.simulated[s.dark] for s in (frame.along_x, frame.along_y)])
@@ -118,8 +136,13 @@ def draw_centres(axes: Any, frames: Sequence[FrameEvaluation]) -> None:
     """Draw the observed and simulated light at the centre, by time."""
     minutes = each(frames, "time_s") / 60
     observed, simulated = each(frames, "centre_dn_s").T
-    style = points(_OBSERVED, marker_size(len(frames)))
-    axes.errorbar(minutes, observed, each(frames, "centre_noise_dn_s"), label="observed", **style)
+    axes.errorbar(
+        minutes,
+        observed,
+        each(frames, "centre_noise_dn_s"),
+        label="observed",
+        **points(_OBSERVED, marker_size(len(frames))),
+    )
     axes.plot(minutes, simulated, "x", color=_SIMULATED, markersize=6, markeredgewidth=1.4, label="simulated")
     known = np.concatenate([v[np.isfinite(v) & (v > 0)] for v in (observed, simulated)])
     if known.size:
@@ -133,18 +156,21 @@ def draw_maps(band: Any, panels: Sequence[Any], maps: Superposed) -> None:
     mpe_top = max(maps.mpe_largest_pct, 1e-3)
     mape_top = max(float(np.nanmax([maps.mape_pct, maps.noise_mape_pct])), 1e-3)
     half = maps.half_px + 0.5
-    box: dict[str, Any] = {
-        "origin": "lower",
-        "extent": (-half, half, -half, half),
-        "interpolation": "nearest",
-    }
     for axes, values, title, limits, colours in (
         (panels[0], maps.mpe_pct, "MPE", (-mpe_top, mpe_top), CHANGE.with_extremes(bad="white")),
         (panels[1], maps.noise_mpe_pct, "σ of the MPE, noise alone", (0.0, mpe_top), "viridis"),
         (panels[2], maps.mape_pct, "MAPE", (0.0, mape_top), "viridis"),
         (panels[3], maps.noise_mape_pct, "MAPE, noise alone", (0.0, mape_top), "viridis"),
     ):
-        drawn = axes.imshow(values, cmap=colours, vmin=limits[0], vmax=limits[1], **box)
+        drawn = axes.imshow(
+            values,
+            origin="lower",
+            extent=(-half, half, -half, half),
+            interpolation="nearest",
+            cmap=colours,
+            vmin=limits[0],
+            vmax=limits[1],
+        )
         axes.set(xlabel="x from centre (px)", ylabel="y from centre (px)")
         axes.set_title(title, fontsize=11)
         band.colorbar(drawn, ax=axes, label="% of the disc's mean", shrink=0.8)

@@ -23,13 +23,10 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from psfcore.arrays import json_attributes, json_values
+from psfcore.arrays import Vector, json_attributes, json_values
 from psfcore.evaluation.evaluation import Evaluation, FrameEvaluation, Superposed, rms
 from psfcore.scatter.validation.robustness import DarkOffsetStudy
-
-Vector = NDArray[np.float64]
 
 SCHEMA = "evaluation/1"
 TREND_PX = 100.0  # slopes are given as the change over this number of pixels

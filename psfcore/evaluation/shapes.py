@@ -25,8 +25,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from psfcore.arrays import Kernel, Matrix, Vector
 from psfcore.errors import DataError
 from psfcore.evaluation.evaluation import (
     LEAST_SHARE,
@@ -37,12 +37,10 @@ from psfcore.evaluation.evaluation import (
 )
 from psfcore.scatter.inversion import invert
 from psfcore.scatter.reconstruction import Inversion, Progress, Solution, labelled
-from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW, Vector
+from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW
 from psfcore.scatter.validation.cross_validation import FoldSample, held_out_folds, shared_step
 from psfcore.scatter.validation.free_shells import free_kernel, free_shares, law_light
-from psfcore.transit.transit import Kernel, folds
-
-Floats = NDArray[np.float64]
+from psfcore.transit.transit import folds
 
 FREE_SHELLS = "free-shells"
 STRETCHED = ("stretched-along-x", "stretched")
@@ -185,7 +183,7 @@ def _of_folds(solution: Solution, kernel_of: Callable[[FoldSample, Vector], Kern
     return lambda n: kernels[fold_of[n]]
 
 
-def _figures(frames: list[FrameEvaluation], counts: Floats) -> Floats:
+def _figures(frames: list[FrameEvaluation], counts: Matrix) -> Matrix:
     """FIGURES for all images (first column) and for each bootstrap sample, (FIGURES, 1 + BOOTSTRAP_SAMPLES)."""
     half_px = half_width_px(max(frame.found.place.radius_px for frame in frames))
     maps = superposed_maps(frames, [frame.pe_pct for frame in frames], half_px).reshape(len(frames), -1)
@@ -207,7 +205,7 @@ def _figures(frames: list[FrameEvaluation], counts: Floats) -> Floats:
     )
 
 
-def _with_errors(figures: Floats) -> dict[str, tuple[float, float]]:
+def _with_errors(figures: Matrix) -> dict[str, tuple[float, float]]:
     return {
         name: (float(values[0]), float(values[1:].std(ddof=1)))
         for name, values in zip(FIGURES, figures, strict=True)

@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.optimize import nnls
 
-from psfcore.arrays import json_attributes
+from psfcore.arrays import Flags, Plane, Vector, json_attributes
 from psfcore.errors import DataError
 from psfcore.psf import Psf
 from psfcore.scatter.total_psf import DIFFRACTION, SCATTER
@@ -53,10 +53,6 @@ FEWEST_DISTANCES = 20
 _CONSTRAINT_WEIGHT = 1e4
 # A pixel with a smaller fraction of the light of the box does not count as a free parameter.
 _USED_SHARE = 1e-6
-
-Plane = NDArray[np.float64]
-Flags = NDArray[np.bool_]
-Vector = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

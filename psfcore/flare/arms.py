@@ -36,16 +36,14 @@ import numpy as np
 from scipy import ndimage
 from threadpoolctl import threadpool_limits
 
+from psfcore.arrays import Flags, Plane, Vector
 from psfcore.errors import DataError
 from psfcore.flare.arms_fit import (
     NEEDED_ORDERS_AN_ARM,
     FitResult,
     FitState,
-    Flags,
     Geometry,
     Orders,
-    Plane,
-    Vector,
     first_fit,
     first_source,
     iterate,
@@ -66,13 +64,12 @@ _NEAR_ORDERS = 6  # the first fit uses at least this number of orders on each si
 
 @dataclass(frozen=True)
 class Peak:
-    """One diffraction order: index of its arm, order k, fitted position (px). significance: amplitude / error."""
+    """One diffraction order: index of its arm, order k, fitted position (px)."""
 
     arm: int
     order: int
     x_px: float
     y_px: float
-    significance: float
 
 
 @dataclass(frozen=True)
@@ -150,10 +147,9 @@ def _measurement(
     by_angle = np.argsort(angles)
     place = np.argsort(by_angle)
     x, y = order_positions(geometry.centre, state.pattern, orders.arm, orders.k)
-    significance = state.amplitude / result.error[arms + 1 :]
     peaks = tuple(
-        Peak(int(place[arm]), int(k), float(px), float(py), float(s))
-        for arm, k, px, py, s in zip(orders.arm, orders.k, x, y, significance, strict=True)
+        Peak(int(place[arm]), int(k), float(px), float(py))
+        for arm, k, px, py in zip(orders.arm, orders.k, x, y, strict=True)
     )
     model, fitted = np.zeros(halo.shape), np.zeros(halo.shape, dtype=bool)
     model[orders.row, orders.column] = result.light + halo[orders.row, orders.column]
@@ -226,10 +222,10 @@ def source_centre(
     scatter = float(1.4826 * np.median(np.abs(values - middle)))  # from the median absolute deviation
     peak = float(values.max())
     if not peak > middle + _FLARE_SIGMA * scatter:
-        wanted = f"a spot at least {_FLARE_SIGMA:g} times the scatter ({scatter:.3g}) above the median ({middle:.3g})"
         raise DataError(
             "no-flare",
-            f"expected a flare, {wanted}; got {peak:.3g} at the brightest pixel: give its centre, or use another image",
+            f"expected a flare, a spot at least {_FLARE_SIGMA:g} times the scatter ({scatter:.3g}) above the median "
+            f"({middle:.3g}); got {peak:.3g} at the brightest pixel: give its centre, or use another image",
         )
     brightest = np.unravel_index(int(np.where(usable, smoothed, -np.inf).argmax()), smoothed.shape)
     return (float(brightest[1]), float(brightest[0])), radius

@@ -12,12 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from psfcore.arrays import Flags, Plane, Vector
 from psfcore.errors import DataError
 
-Vector = NDArray[np.float64]
 Indices = NDArray[np.intp]
-Plane = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 NEEDED_ORDERS_AN_ARM = 3
 KNOT_PX = 1.0  # distance between the knots of the spline
@@ -155,10 +153,10 @@ def check_enough_orders(arm: Indices, arms: int) -> None:
     """Raise DataError "too-few-peaks" if an arm has fewer than NEEDED_ORDERS_AN_ARM orders."""
     count = np.bincount(arm, minlength=arms)
     if count.min() < NEEDED_ORDERS_AN_ARM:
-        wanted = f"at least {NEEDED_ORDERS_AN_ARM} orders above {ORDER_SIGMA:g} sigma on each arm"
         raise DataError(
             "too-few-peaks",
-            f"expected {wanted}; got {', '.join(map(str, count))}: fit fewer arms, or use a brighter flare",
+            f"expected at least {NEEDED_ORDERS_AN_ARM} orders above {ORDER_SIGMA:g} sigma on each arm; got "
+            f"{', '.join(map(str, count))}: fit fewer arms, or use a brighter flare",
         )
 
 

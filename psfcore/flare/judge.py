@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from psfcore.arrays import Flags, Plane
 from psfcore.errors import DataError
 from psfcore.fits.units import parse_unit, rate_label, unit_label
 from psfcore.flare.arm_profile import BOX_PX, FlareComparison, compare_on_flare, flare_centre
@@ -19,8 +19,6 @@ from psfcore.psf_sampling import check_compatible
 ENOUGH_EXPLAINED = 0.5
 WELL_MATCHED_PCT = 3.0
 
-Plane = NDArray[np.float64]
-
 
 @dataclass(frozen=True, eq=False)
 class FlareTest:
@@ -31,7 +29,7 @@ class FlareTest:
 
     comparison: FlareComparison
     difference: Plane
-    usable: NDArray[np.bool_]
+    usable: Flags
     unit: str
 
 
@@ -78,19 +76,19 @@ def _same_unit(flaring: Image, before: Image) -> tuple[Plane, Plane, str]:
     Pixels without a value become 0.
     """
     if flaring.pixels.shape != before.pixels.shape:
-        shapes = f"{flaring.pixels.shape} and {before.pixels.shape}"
         raise DataError(
-            "flare-shapes", f"expected two images of the same shape; got {shapes}: cut both to the same field"
+            "flare-shapes",
+            f"expected two images of the same shape; got {flaring.pixels.shape} and {before.pixels.shape}: cut both to the "
+            "same field",
         )
     rates = [_rate(image) for image in (flaring, before)]
     if flaring.exposure_s is None and before.exposure_s is None and flaring.unit == before.unit:
         rates, unit = [flaring.pixels, before.pixels], unit_label(flaring)
     elif rates[0] is None or rates[1] is None:
-        exposures = f"{flaring.exposure_s} and {before.exposure_s} s"
         raise DataError(
             "flare-units",
-            f"expected the exposure time of both images or of neither; got {exposures}: add XPOSURE to the header "
-            "without it",
+            f"expected the exposure time of both images or of neither; got {flaring.exposure_s} and {before.exposure_s} s: "
+            "add XPOSURE to the header without it",
         )
     else:
         unit = rate_label(flaring)
@@ -115,7 +113,7 @@ def _variance(noise: Noise, image: Image) -> Plane:
 
 
 def _measured_arm(
-    light: Plane, quiet: Plane, usable: NDArray[np.bool_], centre_xy: tuple[int, int], reach_px: float
+    light: Plane, quiet: Plane, usable: Flags, centre_xy: tuple[int, int], reach_px: float
 ) -> float:
     """The direction (degrees) of the arm nearest to +x, measured out to reach_px."""
     try:

@@ -197,5 +197,4 @@ def _draw_cuts(axes: Any, image: NDArray[np.float64], found: ArmMeasurement) -> 
         ylabel="Image (grey) and fit (colour), one curve per arm",
     )
     axes.set_yticks([])
-    for side in ("top", "right", "left"):
-        axes.spines[side].set_visible(False)
+    axes.spines[["top", "right", "left"]].set_visible(False)

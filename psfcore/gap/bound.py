@@ -37,7 +37,7 @@ from psfcore.gap.evidence.linear_model import LinearModel
 from psfcore.gap.evidence.responses import gather
 from psfcore.gap.evidence.tree import FAMILIES
 from psfcore.gap.library.registry import LIBRARY
-from psfcore.gap.verdict.answer import NONE, ONE, Labels, causes_of, label_of, prior_of
+from psfcore.gap.verdict.answer import NONE, ONE, Labels, causes_of, label_of, prior_of, sums
 from psfcore.scatter.inversion import invert
 from psfcore.transit.folder import read_transit
 from psfcore.transit.transit import Transit
@@ -124,14 +124,11 @@ def _bound(
     prior = prior_of(known)
     weights = np.array([np.log(ONE * prior[form]) + closed.of_form(form)[0] for form in known])
     whole = np.concatenate([np.full((1, DRAWS), np.log(NONE)), weights])
+    labels: list[Labels] = [frozenset(), *(frozenset([label_of(form)]) for form in known)]
     right = {"name": 0, "family": 0, "stage": 0}
     detected, stages = 0, {FAMILIES[family].stage for family in cause.families}
     for draw in np.exp(whole - logsumexp(whole, axis=0)).T:
-        by_label: dict[Labels, float] = {frozenset(): float(draw[0])}
-        for form, share in zip(known, draw[1:], strict=True):
-            label = frozenset([label_of(form)])
-            by_label[label] = by_label.get(label, 0.0) + float(share)
-        told = causes_of(by_label, LEVEL)
+        told = causes_of(sums(zip(labels, draw.tolist(), strict=True)), LEVEL)
         if not told:
             continue
         detected += 1

@@ -19,11 +19,12 @@ from typing import Any
 
 import numpy as np
 
+from psfcore.arrays import Kernel
 from psfcore.errors import DataError
 from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.verdict.correction import Corrected
 from psfcore.gap.view import Field, View
-from psfcore.psf import REACH_GRID_PX, Kernel, Psf
+from psfcore.psf import REACH_GRID_PX, Psf
 from psfcore.scatter.fit import psf_of_fit
 from psfcore.scatter.total_psf import Lanes, Optics, TotalPsf
 from psfcore.transit.transit import Place

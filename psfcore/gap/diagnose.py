@@ -20,6 +20,7 @@ from functools import partial
 
 import numpy as np
 
+from psfcore.arrays import Vector
 from psfcore.errors import DataError
 from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.columns import FieldShape, with_effect
@@ -49,7 +50,7 @@ from psfcore.gap.view import View, return_unused_memory
 from psfcore.psf import Psf
 from psfcore.scatter.inversion import Inverter, solution_of
 from psfcore.scatter.reconstruction import Progress, Solution, labelled
-from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Shape, Vector, shape_named
+from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Shape, shape_named
 from psfcore.transit.transit import Fold, Transit
 
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from psfcore.arrays import Kernel
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits
 from psfcore.gap.effect import Effect
@@ -26,9 +27,9 @@ from psfcore.gap.verdict.answer import FLOOR
 from psfcore.gap.verdict.limits import Limits, limits
 from psfcore.gap.view import View
 from psfcore.instruments.files import instrument_names
-from psfcore.scatter.inversion import invert
+from psfcore.scatter.inversion import LEAST_FRAMES, invert
 from psfcore.scatter.reconstruction import Progress
-from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Kernel
+from psfcore.scatter.shapes import SOFTENED_POWER_LAW
 from psfcore.simulate.inputs import LARGEST_DIFFRACTION_PX, diffraction_kernel, read_plan
 from psfcore.simulate.plan import Plan
 from psfcore.simulate.scatter_truth import ScatterTruth
@@ -40,7 +41,6 @@ SCHEMA = "gap-plan/1"
 INSTRUMENT = "hri_euv"
 SCATTER = ScatterTruth(6.15, 2.53, 0.411)  # the scatter of HRI_EUV (Hofmeister et al.)
 BRIGHTNESS_SPREAD = 0.01
-LEAST_IMAGES = 3  # the fit of a PSF needs this number of images
 _BRIGHTNESS_STREAM = 3001
 
 
@@ -142,10 +142,10 @@ def planned_limits(
 
 
 def _check_images(plan: Plan) -> None:
-    if len(plan.shots) < LEAST_IMAGES:
+    if len(plan.shots) < LEAST_FRAMES:
         raise DataError(
             "too-few-images",
-            f"expected a plan with at least {LEAST_IMAGES} images, which the fit of a PSF needs; got {len(plan.shots)}: add images",
+            f"expected a plan with at least {LEAST_FRAMES} images, which the fit of a PSF needs; got {len(plan.shots)}: add images",
         )
 
 

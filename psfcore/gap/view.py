@@ -10,19 +10,19 @@ import ctypes
 import gc
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache, partial
 from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.arrays import Flags, Vector
 from psfcore.scatter.reconstruction import Solution
 from psfcore.scatter.total_psf import Blur, Lanes, put
 from psfcore.transit.occulter import coverage, disc_distance, neighbours_of, patch_window
+from psfcore.transit.transit import Frame
 
 Field = NDArray[np.float32]
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
 Result = TypeVar("Result")
 DISC_MARGIN_PX = 2.0
 # Most memory for one kind of field; at least LEAST_KEPT fields are kept, whatever their size.
@@ -31,25 +31,25 @@ LEAST_KEPT = 4
 
 
 class _LazyFields(Sequence[Field]):
-    """One field per image. A field is computed when it is first used. Read-only.
+    """One field per image, of `images` images. A field is computed when it is first used. Read-only.
 
-    Computed fields are kept up to KEPT_BYTES (about thirty images of 512 px), but always the last LEAST_KEPT fields.
+    The last computed fields are kept, up to KEPT_BYTES (about thirty images of 512 px), but at least LEAST_KEPT.
     """
 
-    def __init__(self, count: int, field: Callable[[int], Field]) -> None:
-        self._count, self._field = count, field
-        self._kept: dict[int, Field] = {}
+    def __init__(self, images: Sequence[Frame], field: Callable[[int], Field]) -> None:
+        kept = max(KEPT_BYTES // images[0].pixels.nbytes, LEAST_KEPT)
+        self._count, self._field = len(images), lru_cache(kept)(field)
 
     def __len__(self) -> int:
         return self._count
 
     def __getitem__(self, index):  # type: ignore[no-untyped-def]
-        if index not in self._kept:
-            field = self._field(index)
-            if (len(self._kept) + 1) * field.nbytes > KEPT_BYTES and len(self._kept) >= LEAST_KEPT:
-                self._kept.pop(next(iter(self._kept)))
-            self._kept[index] = field
-        return self._kept[index]
+        return self._field(index)
+
+
+def _of_each_image(field: Callable[[View, int], Field]) -> cached_property[Sequence[Field]]:
+    """The fields of all images: the decorated method computes the field of one image."""
+    return cached_property(lambda view: _LazyFields(view.solution.transit.frames, partial(field, view)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,14 +86,11 @@ class View:
             Blur(slope, solution.transit.shape, threads=solution.threads) for slope in self.slope_kernels
         )
 
-    @cached_property
-    def expected(self) -> Sequence[Field]:
+    @_of_each_image
+    def expected(self, n: int) -> Field:
         """The model image of every image [y, x], DN/s."""
         optics = self.solution.optics
-        return self._lazy(lambda n: optics.field(optics.convolve(self.occulted_scenes[n])))
-
-    def _lazy(self, field: Callable[[int], Any]) -> _LazyFields:
-        return _LazyFields(len(self.solution.transit.frames), field)
+        return optics.field(optics.convolve(self.occulted_scenes[n]))
 
     def behind(self, n: int) -> Field | None:
         """The scene behind the occulter of image n [y, x], DN/s: the mean scene of the neighbouring images in time.
@@ -106,12 +103,9 @@ class View:
         scenes = [solution.optics.field(solution.sky.scenes[k]) for k in chosen]
         return np.asarray(np.mean(scenes, axis=0), dtype=np.float32) if scenes else None
 
-    @cached_property
-    def unocculted(self) -> Sequence[Field]:
+    @_of_each_image
+    def unocculted(self, n: int) -> Field:
         """Every observed image [y, x], DN/s, plus the light that its occulter hides."""
-        return self._lazy(self._put_back)
-
-    def _put_back(self, n: int) -> Field:
         solution = self.solution
         optics, seen = solution.optics, solution.transit.frames[n].pixels
         behind = self.behind(n)
@@ -148,7 +142,7 @@ class View:
             sums[frame.pointing] = (total + scene * away, count + away)
         return sums
 
-    def _own(self, n: int) -> tuple[Field, NDArray[np.bool_]]:
+    def _own(self, n: int) -> tuple[Field, Flags]:
         """The scene of frame n, and a mask of the pixels away from its disc."""
         solution = self.solution
         place = solution.sky.found[n].place
@@ -161,16 +155,13 @@ class View:
         own, _ = self._own(n)
         return np.asarray(np.where(count > 0, total / np.maximum(count, 1), own), dtype=np.float32)
 
-    @cached_property
-    def scenes(self) -> Sequence[Field]:
+    @_of_each_image
+    def scenes(self, n: int) -> Field:
         """The scene [y, x] of every image, DN/s, without the occulter: the mean scene of the other images of the same pointing.
 
         This mean is scaled to the brightness of the image. A template that is made from the scene of the same image would
         contain the noise of its residual, and would fit this noise.
         """
-        return self._lazy(self._scene)
-
-    def _scene(self, n: int) -> Field:
         own, away = self._own(n)
         total, count = self._scene_sums[self.solution.transit.frames[n].pointing]
         others = count - away
@@ -195,12 +186,9 @@ class View:
         out[window] -= (coverage(shape, place)[window] * shown).astype(np.float32)
         return out
 
-    @cached_property
-    def occulted_scenes(self) -> Sequence[Lanes]:
+    @_of_each_image
+    def occulted_scenes(self, n: int) -> Lanes:
         """The scene of every image with its occulter in front, in the memory order of the convolution engine. Read-only."""
-        return self._lazy(self._occulted_scene)
-
-    def _occulted_scene(self, n: int) -> Lanes:
         scene = self.solution.optics.lanes(self.scenes[n] * self.uncovered(n))
         put(scene, self.solution.sky.dark[n], 0.0)
         return scene

@@ -43,7 +43,7 @@ Positive = Annotated[Number, Field(gt=0)]
 _LEAST, _MOST = 1e-9, 1e9
 Size = Annotated[Number, Field(ge=_LEAST, le=_MOST)]
 SizeOrNone = Annotated[Number, Field(ge=0, le=_MOST)]
-Place = Annotated[Number, Field(ge=-_MOST, le=_MOST)]
+Coordinate = Annotated[Number, Field(ge=-_MOST, le=_MOST)]
 Count = Annotated[Whole, Field(ge=1, le=100_000)]
 # The numbers of parts of an instrument. Memory and time of a PSF grow with them; the shipped instruments have at most 3
 # meshes of 551 windows, 8 rays, 2 rings and 1 spectral line.
@@ -112,7 +112,7 @@ class Aperture:
     diameter_mm: Size
     obscuration_diameter_mm: SizeOrNone = 0.0
     sector: Sector | None = None
-    corners_mm: Annotated[tuple[tuple[Place, Place], ...], Field(max_length=MOST_CORNERS)] = ()
+    corners_mm: Annotated[tuple[tuple[Coordinate, Coordinate], ...], Field(max_length=MOST_CORNERS)] = ()
 
     @property
     def round(self) -> bool:
@@ -229,7 +229,9 @@ class Ring:
 class Polygon:
     """An opaque polygon with corners (x, y) in mm from the centre of the aperture."""
 
-    corners_mm: Annotated[tuple[tuple[Place, Place], ...], Field(min_length=3, max_length=MOST_CORNERS)]
+    corners_mm: Annotated[
+        tuple[tuple[Coordinate, Coordinate], ...], Field(min_length=3, max_length=MOST_CORNERS)
+    ]
 
 
 @dataclass(frozen=True, kw_only=True, config=_CONFIG)

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from psfcore.arrays import Matrix, Vector
 from psfcore.drawing.page import PLOT_DPI
 from psfcore.drawing.plots import (
     FARTHEST_PX,
@@ -37,7 +37,6 @@ from psfcore.evaluation.plots import (
 from psfcore.evaluation.report import each
 from psfcore.report.report import CrossValidated, PsfReport
 from psfcore.scatter.fit import RADII_PX, TransitFit
-from psfcore.scatter.shapes import Vector
 from psfcore.scatter.total_psf import DIFFRACTION, SCATTER
 from psfcore.scatter.validation.cross_validation import ShellBands
 from psfcore.scatter.validation.robustness import DarkOffsetStudy
@@ -53,10 +52,9 @@ _FREE, _BAND = "#1f6fb4", "#4f8cc4"
 def curves_png(report: PsfReport) -> bytes:
     """1 - encircled energy of the total PSF. For a fit, also of its diffuse scatter, with the uncertainties below."""
     if report.fit is None:
-        figure, (total,) = _figure(5.6, 3.9, 1)
-        _draw_curve(total, report, TOTAL, "Total PSF")
-        legend(total, 8)
-        charts = [total]
+        figure, charts = _figure(5.6, 3.9, 1)
+        _draw_curve(charts[0], report, TOTAL, "Total PSF")
+        legend(charts[0], 8)
     else:
         figure, charts = _figure(WIDTH_IN, 7.0, 2, 2, heights=(1.3, 1.0))
         for axes, name, title in zip(
@@ -74,7 +72,7 @@ def curves_png(report: PsfReport) -> bytes:
             low, high = axes.get_ylim()
             axes.set_ylim(low, high + 0.45 * (high - low))  # room for the legend
             legend(axes, 7.5, ncols=2)
-    return _png(figure, charts)
+    return _tidy_png(figure, charts)
 
 
 def _draw_curve(axes: Any, report: PsfReport, name: str, title: str) -> None:
@@ -94,13 +92,18 @@ def _draw_spread(axes: Any, report: PsfReport, name: str) -> None:
         draw_band(axes, *found, _BAND, "folds: median, 1 and 2 sigma")
     axes.axhline(0, color="#555555", linewidth=1.0)
     shown = np.searchsorted(radii, [r for r in RADII_PX if r < radii[-1]])
-    style = {"label": "fit to all images, ±1 σ", **points(_COLOURS[name], 3.0)}
-    axes.errorbar(radii[shown], np.zeros(shown.size), sigma[shown], **style)
+    axes.errorbar(
+        radii[shown],
+        np.zeros(shown.size),
+        sigma[shown],
+        label="fit to all images, ±1 σ",
+        **points(_COLOURS[name], 3.0),
+    )
     axes.set(ylabel="Difference from the fit (points)")
     along_distance(axes, max(report.transit.shape), "Distance R (px)")
 
 
-def _folds_of(report: PsfReport, name: str) -> tuple[Vector, NDArray[np.float64]] | None:
+def _folds_of(report: PsfReport, name: str) -> tuple[Vector, Matrix] | None:
     """Two arrays: radii, and the bands of the folds minus the fitted curve of a component.
 
     None if there is no cross-validation or it has no bands of this component.
@@ -167,15 +170,21 @@ def profile_png(report: PsfReport) -> bytes:
         lit = weight > 0
         sigma = np.array(profile["sigma"].get(name, np.zeros(weight.size)))[lit]
         at, mean = np.maximum(radius, NEAREST_PX)[lit], weight[lit]
-        shade: dict[str, Any] = {"color": _COLOURS[name], "alpha": 0.3, "linewidth": 0}
-        axes.fill_between(at, np.maximum(mean - sigma, 0.05 * mean), mean + sigma, **shade)
+        axes.fill_between(
+            at,
+            np.maximum(mean - sigma, 0.05 * mean),
+            mean + sigma,
+            color=_COLOURS[name],
+            alpha=0.3,
+            linewidth=0,
+        )
         axes.plot(at, mean, color=_COLOURS[name], linewidth=1.5, label=_NAMES[name])
         if name != DIFFRACTION:
             lowest.append(float(mean[radius[lit] < FARTHEST_PX].min()))
     axes.set(yscale="log", ylim=(min(lowest) / 5, 2), ylabel="Mean weight (fraction of the light per pixel)")
     along_distance(axes, max(report.transit.shape), "Distance from the centre (px)")
     legend(axes)
-    return _png(figure, [axes])
+    return _tidy_png(figure, [axes])
 
 
 def weights_png(report: PsfReport, shells: ShellBands) -> bytes:
@@ -190,19 +199,25 @@ def weights_png(report: PsfReport, shells: ShellBands) -> bytes:
     axes.set_ylabel("Diffuse weight (fraction of the light per pixel)")
     along_distance(axes, field_px)
     legend(axes)
-    return _png(figure, [axes])
+    return _tidy_png(figure, [axes])
 
 
 def totals_png(cross: CrossValidated, fit: TransitFit) -> bytes:
     """Histogram of the total diffuse scatter over the folds."""
     figure, (axes,) = _figure(6.4, 3.4, 1)
     total, sigma = 100 * fit.inversion.values["total"], 100 * fit.value_sigma["total"]
-    style: dict[str, Any] = {"color": _COLOURS[SCATTER], "alpha": 0.2, "linewidth": 0}
-    axes.axvspan(total - sigma, total + sigma, label="error of that fit, ±1 σ", **style)
+    axes.axvspan(
+        total - sigma,
+        total + sigma,
+        color=_COLOURS[SCATTER],
+        alpha=0.2,
+        linewidth=0,
+        label="error of that fit, ±1 σ",
+    )
     draw_totals(axes, cross.bands.totals, _BAND)
     axes.axvline(total, color=_COLOURS[SCATTER], linewidth=1.6, label="fit to all images")
     legend(axes, loc="best")
-    return _png(figure, [axes])
+    return _tidy_png(figure, [axes])
 
 
 def slices_png(evaluation: Evaluation) -> bytes:
@@ -211,12 +226,8 @@ def slices_png(evaluation: Evaluation) -> bytes:
     across = min(len(shown), 3)
     rows = -(-len(shown) // across)
     figure, charts = _figure(WIDTH_IN * max(across, 2) / 3, 3.3 * rows, across, rows)
-    for axes, frame in zip(charts, shown, strict=False):
-        draw_slices(axes, frame)
-        boxed_legend(axes, 7, "upper center")
-    for axes in charts[len(shown) :]:
-        axes.set_visible(False)
-    return _png(figure, charts)
+    draw_slices(charts, shown, 7)
+    return _tidy_png(figure, charts)
 
 
 def maps_png(maps: Superposed) -> bytes:
@@ -238,9 +249,8 @@ def residuals_png(evaluation: Evaluation) -> bytes:
             axes.set(xlabel=label if row else "")
         charts[3 * row].set_ylabel(f"{name}: residual (%)")
     labelled = charts[0].get_legend_handles_labels()
-    style: dict[str, Any] = {"ncols": 8, "fontsize": 9, "frameon": False}
-    figure.legend(*labelled, title="pointing", loc="outside upper center", **style)
-    return _png(figure, charts)
+    figure.legend(*labelled, title="pointing", loc="outside upper center", ncols=8, fontsize=9, frameon=False)
+    return _tidy_png(figure, charts)
 
 
 def intensities_png(evaluation: Evaluation) -> bytes:
@@ -248,7 +258,7 @@ def intensities_png(evaluation: Evaluation) -> bytes:
     figure, charts = _figure(WIDTH_IN, 3.9, 2)
     draw_centres(charts[0], evaluation.frames)
     draw_absolute(charts[1], evaluation.frames)
-    return _png(figure, charts)
+    return _tidy_png(figure, charts)
 
 
 def offsets_png(study: DarkOffsetStudy) -> bytes:
@@ -258,10 +268,11 @@ def offsets_png(study: DarkOffsetStudy) -> bytes:
     for axes, title in zip(charts, ("Diffuse weights", "1 - encircled energy"), strict=True):
         axes.set_title(title)
         boxed_legend(axes, 7.5)
-    return _png(figure, charts)
+    return _tidy_png(figure, charts)
 
 
-def _png(figure: Any, charts: list[Any]) -> bytes:
+def _tidy_png(figure: Figure, charts: list[Any]) -> bytes:
+    """A figure as PNG, with tidy charts."""
     tidy(charts)
     return png_of(figure)
 

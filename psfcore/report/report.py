@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from itertools import count
 from typing import Any, TypeVar
 
+from psfcore.arrays import Kernel
 from psfcore.errors import DataError
 from psfcore.evaluation.evaluation import Evaluation, evaluate
 from psfcore.evaluation.report import report as evaluation_json
@@ -41,7 +42,7 @@ from psfcore.scatter.validation.cross_validation import (
 from psfcore.scatter.validation.robustness import OFFSETS_DN, DarkOffsetStudy, dark_offset_study
 from psfcore.tables.make import tables_of
 from psfcore.transit.prepare import Prepared
-from psfcore.transit.transit import Kernel, Transit
+from psfcore.transit.transit import Transit
 
 SCHEMA = "psf-report/1"
 # The relative costs of the stages.

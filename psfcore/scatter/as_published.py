@@ -37,6 +37,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares, lsq_linear
 from threadpoolctl import threadpool_limits
 
+from psfcore.arrays import Kernel, Matrix, Vector
 from psfcore.convolution.convolver import Convolver
 from psfcore.convolution.engine import Engine
 from psfcore.deconvolve.conditions import Conditions, PreparedPsfs
@@ -54,12 +55,10 @@ from psfcore.psf import (
 )
 from psfcore.scatter.reconstruction import Progress
 from psfcore.scatter.segments import Segments, segment_sums, shells_as_published
-from psfcore.scatter.shapes import Vector
-from psfcore.scatter.total_psf import Kernel
+from psfcore.scatter.shapes import pixel_radii
 from psfcore.transit.occulter import FoundPlace, disc_distance, find_occulter, fully_dark
 from psfcore.transit.transit import Frame, Transit
 
-Matrix = NDArray[np.float64]
 Solve = Callable[
     [Matrix, Vector], tuple[Vector, float]
 ]  # to the coefficients and their sum of squared misfits
@@ -244,14 +243,12 @@ def _segment_mean(segments: Segments) -> Callable[[Vector], Vector]:
 
     A segment whose pixels have more than MOST_RINGS distances is divided into as many rings, each with its mean distance.
     """
-    side = segments.reach_grid_px
-    squares, count = np.unique(squared_radii((side, side)), return_counts=True)
-    distance = np.sqrt(squares)
+    distance, count = pixel_radii(segments.reach_grid_px)
     shell = np.searchsorted(segments.edges_px, distance, side="right") - 1
     radii, shares = [], []
     for k in range(segments.size):
         here = shell == k
-        r, n = distance[here], count[here].astype(np.float64)
+        r, n = distance[here], count[here]
         if r.size > MOST_RINGS:
             ring = np.linspace(0, MOST_RINGS, r.size, endpoint=False).astype(int)
             total = np.bincount(ring, weights=n)

@@ -28,9 +28,8 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from psfcore.arrays import json_attributes
+from psfcore.arrays import Kernel, Matrix, Vector, json_attributes
 from psfcore.convolution.convolver import Convolver
 from psfcore.deconvolve.iterations.linear import LEAST_TRANSFER
 from psfcore.psf import (
@@ -52,15 +51,13 @@ from psfcore.scatter.as_published import (
 from psfcore.scatter.inversion import Inverter, solution_of
 from psfcore.scatter.reconstruction import Inversion, Progress, Solution
 from psfcore.scatter.segments import Segments, beyond_pct, segment_sums, shells_as_published
-from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Vector, shape_named, stretch_of
+from psfcore.scatter.shapes import SOFTENED_POWER_LAW, shape_named, stretch_of
 from psfcore.scatter.total_psf import Blur, curve_sigma, pick
 from psfcore.scatter.validation.cross_validation import LIMITS, limits_json
 from psfcore.scatter.validation.robustness import ComparedShape, compare_shapes
 from psfcore.transit.first_guess import FirstGuess, first_guess
 from psfcore.transit.occulter import disc_distance
 from psfcore.transit.transit import Transit
-
-Kernel = NDArray[np.float64]
 
 RADII_PX = (*CURVE_RADII_PX, 500.0, 1000.0)
 # A recipe with one corrected bias uses the same subsets as the published recipe, so few subsets show the difference.
@@ -95,13 +92,13 @@ class ShellWeightFits:
     """
 
     segments: Segments
-    weights: NDArray[np.float64]
+    weights: Matrix
 
-    def weights_pct(self, percentiles: tuple[float, ...]) -> NDArray[np.float64]:
+    def weights_pct(self, percentiles: tuple[float, ...]) -> Matrix:
         """The weight per pixel of each shell: percentiles of the fits to the subsets, (percentiles, shells)."""
         return np.asarray(np.percentile(self.weights, percentiles, axis=0))
 
-    def beyond_pct(self, percentiles: tuple[float, ...]) -> NDArray[np.float64]:
+    def beyond_pct(self, percentiles: tuple[float, ...]) -> Matrix:
         """The percentage of the light that is scattered beyond the inner edge of each shell.
 
         The result holds percentiles of the fits to the subsets, (percentiles, shells).
@@ -147,7 +144,7 @@ class TransitFit:
         return {name: factor * sigma for name, sigma in self.inversion.value_sigma.items()}
 
     @property
-    def covariance(self) -> NDArray[np.float64]:
+    def covariance(self) -> Matrix:
         """Covariance matrix of the shape's coordinates, overdispersion included."""
         return self.inversion.covariance * self.overdispersion
 
@@ -359,9 +356,7 @@ def fitted_psf(fit: TransitFit, *, name: str, version: str, provenance: dict[str
     return psf_of_fit(fit.kernel, fit.scatter, fit.solution, fit.covariance, **named)
 
 
-def psf_of_fit(
-    kernel: Kernel, scatter: Kernel, solution: Solution, covariance: NDArray[np.float64], **named: Any
-) -> Psf:
+def psf_of_fit(kernel: Kernel, scatter: Kernel, solution: Solution, covariance: Matrix, **named: Any) -> Psf:
     """A draft PSF with the fitted shape of a solution and the components DIFFRACTION and SCATTER.
 
     covariance: of the coordinates. named: further fields of `Psf`.
@@ -446,9 +441,13 @@ def fit_json(fit: TransitFit) -> dict[str, Any]:
         for s in fit.shapes
     ]
     if fit.free is not None:
-        out["free_shells"] = _free_json(fit.free)
+        out["free_shells"] = {
+            "edges_px": list(fit.free.segments.edges_px),
+            "weight": limits_json(fit.free.weights_pct(LIMITS)),
+            "diffuse_light_beyond_inner_edge_pct": limits_json(fit.free.beyond_pct(LIMITS)),
+        }
     if fit.published is not None:
-        out["as_published"] = _published_json(fit)
+        out["as_published"] = _published_json(fit, fit.published)
     return out
 
 
@@ -472,17 +471,7 @@ def _curve_json(curve: Curve) -> dict[str, list[float]]:
     }
 
 
-def _free_json(free: ShellWeightFits) -> dict[str, Any]:
-    return {
-        "edges_px": list(free.segments.edges_px),
-        "weight": limits_json(free.weights_pct(LIMITS)),
-        "diffuse_light_beyond_inner_edge_pct": limits_json(free.beyond_pct(LIMITS)),
-    }
-
-
-def _published_json(fit: TransitFit) -> dict[str, Any]:
-    published = fit.published
-    assert published is not None
+def _published_json(fit: TransitFit, published: Published) -> dict[str, Any]:
     here = dict(zip(fit.curve.radii_px, fit.curve.pct, strict=True))
 
     def one(p: Published) -> dict[str, Any]:

@@ -36,8 +36,8 @@ from datetime import datetime
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from psfcore.arrays import Kernel, Vector
 from psfcore.convolution.convolver import Convolver
 from psfcore.errors import DataError
 from psfcore.instruments.files import PLATE_SCALE_TOLERANCE, WAVELENGTH_TOLERANCE
@@ -45,9 +45,6 @@ from psfcore.psf import REACH_GRID_PX, FittedShape, Psf, crop_centred
 from psfcore.scatter import total_psf
 from psfcore.scatter.shapes import shape_named
 from psfcore.scatter.total_psf import DIFFRACTION, SCATTER, fit_of
-
-Kernel = NDArray[np.float64]
-Vector = NDArray[np.float64]
 
 # Two kernels count as the same if the sum of the absolute differences of their weights is at most this fraction of the
 # light. Files hold weights as float32, whose rounding changes this sum by less than 1e-7.

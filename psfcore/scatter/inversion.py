@@ -40,8 +40,8 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from psfcore.arrays import Kernel, Matrix, Vector
 from psfcore.errors import DataError
 from psfcore.psf import cumulative_curve
 from psfcore.scatter.reconstruction import (
@@ -54,8 +54,8 @@ from psfcore.scatter.reconstruction import (
     TransitScenes,
     on_threads,
 )
-from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Shape, Vector
-from psfcore.scatter.total_psf import Blur, Kernel, Optics, TotalPsf, noise_covariance
+from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Shape
+from psfcore.scatter.total_psf import Blur, Optics, TotalPsf, noise_covariance
 from psfcore.transit.transit import Transit
 
 ALGORITHM_VERSION = 2  # of `invert`: a change of its results needs a new number, because solutions are kept
@@ -205,8 +205,8 @@ class _Measured:
     residual: Vector
     expected: Vector
     weight: Vector
-    weighted: NDArray[np.float64]
-    normal: NDArray[np.float64]
+    weighted: Matrix
+    normal: Matrix
 
     @property
     def score(self) -> Vector:
@@ -224,7 +224,7 @@ class _Model:
     images: Reconstruction
     slope_blurs: list[Blur]
     curve: Vector
-    curve_slopes: NDArray[np.float64]
+    curve_slopes: Matrix
 
     def twins(self) -> list[_Model]:
         """The same for each thread, see `on_threads`."""
@@ -309,7 +309,7 @@ class _Solver:
         score = np.sum([self._counts[n] * m.score for n, m in measured.items()], axis=0)
         return self._total.shape.shortened(np.linalg.solve(normal, score))
 
-    def _normal(self, measured: dict[int, _Measured]) -> NDArray[np.float64]:
+    def _normal(self, measured: dict[int, _Measured]) -> Matrix:
         """The normal matrix of all images. Raises DataError "transit-says-too-little"."""
         normal = np.sum([self._counts[n] * m.normal for n, m in measured.items()], axis=0)
         _check_determined(normal, self._total.shape)
@@ -363,7 +363,7 @@ class _Solver:
         spread = np.zeros_like(normal)
         fits = []
 
-        def covariance_of(optics: Optics, n: int) -> NDArray[np.float64]:
+        def covariance_of(optics: Optics, n: int) -> Matrix:
             frame, dark, noise = self._sky.transit.frames[n], self._sky.dark[n], self._sky.transit.noise
             templates = [*measured[n].weighted, np.full(dark[0].size, 1 / dark[0].size)]
             # The covariance of the score, and in the last row that of the mean residual, from the noise of all pixels.
@@ -410,7 +410,7 @@ class _Solver:
         return Solution(**vars(model.images), inversion=inversion)
 
 
-def _check_determined(normal: NDArray[np.float64], shape: Shape) -> None:
+def _check_determined(normal: Matrix, shape: Shape) -> None:
     """Raise DataError "transit-says-too-little" if the images do not determine all combinations of the parameters."""
     diagonal = np.sqrt(np.diag(normal))
     if not (np.isfinite(normal).all() and (diagonal > 0).all()):
@@ -421,9 +421,8 @@ def _check_determined(normal: NDArray[np.float64], shape: Shape) -> None:
         )
     weakest = float(np.linalg.eigvalsh(normal / np.outer(diagonal, diagonal))[0])
     if weakest < WEAKEST_DIRECTION:
-        names = ", ".join(shape.names)
         raise DataError(
             "transit-says-too-little",
-            f"expected frames that determine {names}; got frames that leave a combination of them undetermined; "
+            f"expected frames that determine {', '.join(shape.names)}; got frames that leave a combination of them undetermined; "
             "add images at other distances from the limb, or fit a shape with fewer parameters",
         )

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
-from numpy.typing import NDArray
 
+from psfcore.arrays import Kernel, Vector
 from psfcore.drawing.plots import (
     FARTHEST_PX,
     INK,
@@ -32,7 +32,6 @@ from psfcore.psf import REACH_GRID_PX, cumulative_curve, radial_profile
 from psfcore.scatter.as_published import Published
 from psfcore.scatter.fit import TransitFit, fit_sentence
 from psfcore.scatter.inversion import CONVERGED_POINTS
-from psfcore.scatter.shapes import Vector
 from psfcore.scatter.validation.cross_validation import LIMITS, Bands, FoldFit, ShellBands
 from psfcore.transit.first_guess import ESTIMATORS
 
@@ -103,7 +102,7 @@ def _fitted_weights(fit: TransitFit) -> tuple[Vector, Vector, Vector]:
     """
     shape, at = fit.inversion.shape, fit.inversion.coordinates
 
-    def rings(kernel: NDArray[np.float64]) -> tuple[Vector, Vector]:
+    def rings(kernel: Kernel) -> tuple[Vector, Vector]:
         radius, mean = radial_profile(kernel)
         shown = (radius >= 1) & (radius <= FARTHEST_PX)
         return radius[shown], mean[shown]
@@ -136,8 +135,16 @@ def _draw_light(axes: Any, fit: TransitFit) -> None:
 
 def _draw_published_light(axes: Any, published: Published) -> None:
     style: dict[str, Any] = {"color": _PUBLISHED, "linewidth": 1.5}
-    marks = {"marker": "D", "markersize": 4.5, "markerfacecolor": "white", "linestyle": _DASHES}
-    axes.plot(published.radii_px, published.curve_pct, label="total, as published", **marks, **style)
+    axes.plot(
+        published.radii_px,
+        published.curve_pct,
+        marker="D",
+        markersize=4.5,
+        markerfacecolor="white",
+        linestyle=_DASHES,
+        label="total, as published",
+        **style,
+    )
     radii = np.geomspace(NEAREST_PX, published.grid_px / 2, 200)
     beyond = cumulative_curve(published.scatter, radii)
     axes.plot(radii, beyond, linestyle=(0, (1, 1.5)), label="diffuse, as published", **style)
@@ -153,8 +160,9 @@ def _draw_rounds(axes: Any, fit: TransitFit) -> None:
     for here, face, name in ((whole, _TOTAL, "all images"), (~whole, "white", "some images (pilot rounds)")):
         if here.any():
             axes.scatter(number[here], moved[here], s=44, c=face, edgecolors=_TOTAL, zorder=2, label=name)
-    line: dict[str, Any] = {"color": _PUBLISHED, "linewidth": 1.2, "linestyle": _DASHES}
-    axes.axhline(CONVERGED_POINTS, label="convergence limit", **line)
+    axes.axhline(
+        CONVERGED_POINTS, label="convergence limit", color=_PUBLISHED, linewidth=1.2, linestyle=_DASHES
+    )
     low, high = min(moved.min(initial=1.0), CONVERGED_POINTS), max(moved.max(initial=0.1), CONVERGED_POINTS)
     axes.set(yscale="log", xlim=(0.5, len(rounds) + 0.5), ylim=(low / 3, high * 12))
     axes.xaxis.set_major_locator(MaxNLocator(12, integer=True))
@@ -182,8 +190,13 @@ def _draw_first_guess(axes: Any, fit: TransitFit) -> None:
     for name, marker in _ESTIMATOR_STYLES.items():
         axes.plot([], [], marker, color="#777777", label="relative to " + name.replace("_", " "), **style)
     fitted = float(cumulative_curve(fit.kernel, [guess.radius_px])[0])
-    line: dict[str, Any] = {"color": _TOTAL, "linewidth": 1.4, "linestyle": _DASHES}
-    axes.axhline(fitted, label=f"fit: light beyond {guess.radius_px:.1f} px", **line)
+    axes.axhline(
+        fitted,
+        label=f"fit: light beyond {guess.radius_px:.1f} px",
+        color=_TOTAL,
+        linewidth=1.4,
+        linestyle=_DASHES,
+    )
     shown = np.concatenate([r[np.isfinite(r) & (r > 0)] for r in ratios.values()] + [[fitted]])
     low, high = np.log(shown.min()), np.log(shown.max())
     room = max(high - low, 1.0)
@@ -242,8 +255,15 @@ def _draw_shells(charts: Sequence[Any], shells: ShellBands) -> None:
     draw_band(light, shells.edges_px[:-1], shells.law_beyond_pct, _DIFFUSE, "formula")
     light.set(ylim=(0, None), ylabel="1 - encircled energy (%)", title="Diffuse scatter")
     radius, sigma = shells.edges_px[1:], shells.excess_sigma
-    error: dict[str, Any] = {"color": "#bbbbbb", "alpha": 0.5, "linewidth": 0}
-    excess.fill_between(radius, -sigma, sigma, label="error: image noise and prior", **error)
+    excess.fill_between(
+        radius,
+        -sigma,
+        sigma,
+        color="#bbbbbb",
+        alpha=0.5,
+        linewidth=0,
+        label="error: image noise and prior",
+    )
     draw_band(excess, radius, shells.excess_pct, _FREE, "all fits")
     excess.axhline(0.0, color=INK, linewidth=0.8)
     near = shells.near_centre

@@ -14,10 +14,10 @@ from queue import SimpleQueue
 from typing import Self, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from psfcore.scatter.shapes import Shape, Vector
-from psfcore.scatter.total_psf import Blur, Kernel, Lanes, Optics, Pixels, TotalPsf, pick, put
+from psfcore.arrays import Kernel, Matrix, Vector
+from psfcore.scatter.shapes import Shape
+from psfcore.scatter.total_psf import Blur, Lanes, Optics, Pixels, TotalPsf, pick, put
 from psfcore.transit.occulter import LARGEST_SHIFT_PX, FoundPlace, find_occulter, fully_dark
 from psfcore.transit.transit import Frame, Transit
 
@@ -246,7 +246,7 @@ class FrameFit:
     expected: float
     noise: float
     chi2: float
-    normal: NDArray[np.float64]
+    normal: Matrix
     score: Vector
     mean_jacobian: Vector
 
@@ -268,7 +268,7 @@ class Inversion:
 
     shape: Shape
     coordinates: Vector
-    covariance: NDArray[np.float64]
+    covariance: Matrix
     radii_px: Vector
     curve_pct: Vector
     curve_sigma: Vector

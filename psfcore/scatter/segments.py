@@ -43,6 +43,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.arrays import cut
 from psfcore.compiled import compiled
 from psfcore.errors import DataError
 from psfcore.psf import REACH_GRID_PX, squared_radii
@@ -110,14 +111,8 @@ class Segments:
 
         The value is -1 at the centre, outside all shells, and outside the reach grid.
         """
-        whole = self._reach_map
-        out = np.full((size, size), -1, dtype=np.int32)
-        reach = self.reach_grid_px
-        shift = reach // 2 - size // 2
-        source = slice(max(shift, 0), min(shift + size, reach))
-        target = slice(source.start - shift, source.stop - shift)
-        out[target, target] = whole[source, source]
-        return out
+        first = self.reach_grid_px // 2 - size // 2
+        return np.asarray(cut(self._reach_map + 1, first, first, (size, size)) - 1)
 
     def mean_of_map(self, kernel: Floats) -> Floats:
         """psf_S of Eq. (2) for any kernel [y, x] on the reach grid, array (size,). It is 0 for empty segments."""

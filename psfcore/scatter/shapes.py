@@ -38,13 +38,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.arrays import Kernel, Matrix, Vector
 from psfcore.compiled import compiled
 from psfcore.errors import DataError
-from psfcore.psf import REACH_GRID_PX, squared_radii
+from psfcore.psf import REACH_GRID_PX, crop_centred, squared_radii
 
 Values = Mapping[str, float]
-Kernel = NDArray[np.float64]
-Vector = NDArray[np.float64]
 
 FARTHEST = 700.0  # exp of a larger coordinate is no double
 DIFFERENCE = 1e-3  # step of a coordinate for central differences
@@ -126,7 +125,7 @@ class Shape:
         """Parameter values by name at these coordinates."""
         return {p.name: p.value(float(q)) for p, q in zip(self.parameters, coordinates, strict=True)}
 
-    def value_sigma(self, coordinates: Vector, covariance: NDArray[np.float64]) -> dict[str, float]:
+    def value_sigma(self, coordinates: Vector, covariance: Matrix) -> dict[str, float]:
         """Standard errors of the parameters by name. covariance: that of the coordinates."""
         return {
             p.name: abs(p.slope(float(q))) * float(sigma)
@@ -160,9 +159,9 @@ class Shape:
         """The scatter kernel [y, x] of Eq. (1) on (size, size), centre at [size // 2, size // 2]."""
         values = self.values(coordinates)
         if self.radial is not None:
-            falloff_at, (r, count) = self.radial(values), _radii(REACH_GRID_PX)
+            falloff_at, (r, count) = self.radial(values), pixel_radii(REACH_GRID_PX)
             whole = float((falloff_at(r) * count)[1:].sum())
-            by_radius = falloff_at(_radii(size)[0]) * (values["total"] / whole)
+            by_radius = falloff_at(pixel_radii(size)[0]) * (values["total"] / whole)
             by_radius[0] = 1 - values["total"]
             return np.asarray(by_radius[_radius_index(size)])
         assert self.falloff is not None
@@ -170,12 +169,10 @@ class Shape:
         falloff = self.falloff(values, reach)
         middle = reach // 2
         falloff[middle, middle] = 0.0
-        first = middle - REACH_GRID_PX // 2
-        within = falloff[first : first + REACH_GRID_PX, first : first + REACH_GRID_PX]
+        within = crop_centred(falloff, (REACH_GRID_PX, REACH_GRID_PX))
         scaled = falloff * (values["total"] / within.sum())
         scaled[middle, middle] = 1 - values["total"]
-        first = middle - size // 2
-        return np.ascontiguousarray(scaled[first : first + size, first : first + size])
+        return crop_centred(scaled, (size, size))
 
     def slope(self, coordinates: Vector, k: int, size: int) -> Kernel:
         """The derivative of the kernel with respect to coordinate k, [y, x] on (size, size), from central differences."""
@@ -207,7 +204,7 @@ def _one_sided(values: Values, size: int) -> Kernel:
     r = np.hypot(d[:, None], d[None, :])
     r[size // 2, size // 2] = 1.0
     lean = 1 + (values["x_share"] * d[None, :] + values["y_share"] * d[:, None]) / r  # Eq. (4)
-    isotropic = _softened(values)(_radii(size)[0])[_radius_index(size)]
+    isotropic = _softened(values)(pixel_radii(size)[0])[_radius_index(size)]
     return np.asarray(isotropic * np.maximum(lean, 0.0))
 
 
@@ -218,7 +215,7 @@ def _knee(values: Values) -> Radial:
 
 def _mixed(values: Values, share: float, second: Radial) -> Radial:
     """Eq. (2) and a second term, which contains the fraction `share` of `total`."""
-    first, (r, count) = _softened(values), _radii(REACH_GRID_PX)
+    first, (r, count) = _softened(values), pixel_radii(REACH_GRID_PX)
     ratio = float((first(r) * count)[1:].sum()) / float((second(r) * count)[1:].sum())
     return lambda r: np.asarray((1 - share) * first(r) + share * ratio * second(r))
 
@@ -277,7 +274,7 @@ def stretch_of(values: Values) -> tuple[float, float]:
 
 
 @cache
-def _radii(size: int) -> tuple[Vector, Vector]:
+def pixel_radii(size: int) -> tuple[Vector, Vector]:
     """The distinct radii of the pixels of a (size, size) square, in ascending order, and the number of pixels at each."""
     squares, count = np.unique(squared_radii((size, size)), return_counts=True)
     return np.sqrt(squares), count.astype(np.float64)

@@ -48,6 +48,7 @@ import numpy as np
 from astropy.io.fits import Header
 from numpy.typing import NDArray
 
+from psfcore.arrays import Kernel, Matrix, Vector
 from psfcore.convolution.convolver import Convolver
 from psfcore.convolution.engine import BLOCK_ROWS, Engine
 from psfcore.convolution.fft_kernels import LANES
@@ -57,10 +58,9 @@ from psfcore.errors import DataError
 from psfcore.noise import Noise
 from psfcore.psf import CURVE_RADII_PX, REACH_GRID_PX, FittedShape, Psf, encircled_energy
 from psfcore.psf_sampling import psf_for_image
-from psfcore.scatter.shapes import Shape, Vector, shape_named
+from psfcore.scatter.shapes import Shape, shape_named
 from psfcore.transit.transit import Frame
 
-Kernel = NDArray[np.float64]
 DIFFRACTION, SCATTER = "DIFFRACTION", "SCATTER"
 Lanes = NDArray[np.float32]
 Pixels = tuple[NDArray[np.intp], NDArray[np.intp]]  # (rows, columns) of single pixels
@@ -103,12 +103,12 @@ class TotalPsf:
         """The radii of CURVE_RADII_PX that lie on the square."""
         return np.array([r for r in CURVE_RADII_PX if r < self.size // 2])
 
-    def curve_slopes(self, slopes: list[Kernel]) -> NDArray[np.float64]:
+    def curve_slopes(self, slopes: list[Kernel]) -> Matrix:
         """The derivatives of C(R) = 100 (1 - encircled energy), in percent: array (radii, coordinates)."""
         return np.stack([-100 * encircled_energy(slope, self.radii_px) for slope in slopes], axis=1)
 
 
-def curve_sigma(slopes: Iterable[Kernel], covariance: NDArray[np.float64], radii_px: Vector) -> Vector:
+def curve_sigma(slopes: Iterable[Kernel], covariance: Matrix, radii_px: Vector) -> Vector:
     """The standard error of C(R) = 100 (1 - encircled energy) of a kernel, in percent, one for each radius (px).
 
     slopes: the derivatives of the kernel with respect to the coordinates. covariance: that of the coordinates.
@@ -163,9 +163,7 @@ class Blur:
     of the field.
     """
 
-    def __init__(
-        self, kernel: NDArray[np.float64], field_shape: tuple[int, int], *, threads: int = 1
-    ) -> None:
+    def __init__(self, kernel: Kernel, field_shape: tuple[int, int], *, threads: int = 1) -> None:
         self.engine = Engine(kernel, field_shape, threads=threads)
         self._partly_filled = field_shape[0] % BLOCK_ROWS != 0
 
@@ -213,9 +211,7 @@ class Optics(Blur):
     LEAST_TRANSFER of `psfcore.deconvolve.iterations.linear`, and slowly where it is smaller.
     """
 
-    def __init__(
-        self, psf_kernel: NDArray[np.float64], field_shape: tuple[int, int], *, threads: int = 1
-    ) -> None:
+    def __init__(self, psf_kernel: Kernel, field_shape: tuple[int, int], *, threads: int = 1) -> None:
         super().__init__(psf_kernel, field_shape, threads=threads)
         self._inverse = inverse_filter(self.engine)
         self.least_transfer = float(np.abs(transfer_sample(self.engine).values).min())
@@ -230,7 +226,7 @@ class Optics(Blur):
         return solve_linear(self.engine, self._inverse, observed, first, steps)  # Eq. (1)
 
 
-def pick(lanes: Lanes, pixels: Pixels) -> NDArray[np.float64]:
+def pick(lanes: Lanes, pixels: Pixels) -> Vector:
     """Read single pixels (rows, columns) from lanes."""
     return np.asarray(lanes[_index(pixels)], dtype=np.float64)
 
@@ -246,8 +242,8 @@ def _index(pixels: Pixels) -> tuple[NDArray[np.intp], ...]:
 
 
 def noise_covariance(
-    optics: Optics, frame: Frame, dark: Pixels, templates: Sequence[NDArray[np.float64]], noise: Noise
-) -> NDArray[np.float64]:
+    optics: Optics, frame: Frame, dark: Pixels, templates: Sequence[Vector], noise: Noise
+) -> Matrix:
     """Eq. (4): covariance (templates, templates) of the weighted sums over the dark pixels, in (DN/s)^2."""
     b = np.empty((len(templates), frame.pixels.size), dtype=np.float32)
     for row, template in zip(b, templates, strict=True):

@@ -35,9 +35,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from psfcore.convolution.convolver import Convolver
+from psfcore.arrays import Kernel, Plane
 from psfcore.errors import DataError
 from psfcore.psf import CURVE_RADII_PX, REACH_GRID_PX, cumulative_curve, encircled_energy
 from psfcore.simulate.plan import HIGH
@@ -48,10 +47,9 @@ from psfcore.simulate.scatter_truth import (
     convolved,
     kernel_slopes,
 )
+from psfcore.simulate.scene import seen_through
 from psfcore.simulate.sky import TrueSky, fully_dark, on_field
 
-Plane = NDArray[np.float64]
-Kernel = NDArray[np.float64]
 Window = tuple[slice, slice]
 
 PLACE_MARGIN_PX = 5.0
@@ -143,14 +141,17 @@ def _scatter_information(sky: TrueSky, total_slopes: dict[str, Kernel], threads:
     information, dark_pixels = np.zeros((len(PARAMETERS), len(PARAMETERS))), 0
     for pointing in plan.pointings:
         scene = sky.scenes[pointing]
-        whole = {name: _seen(scene, kernel, plan.margin_px, threads) for name, kernel in total_slopes.items()}
+        whole = {
+            name: on_field(seen_through(kernel, scene, threads=threads), plan.margin_px)
+            for name, kernel in total_slopes.items()
+        }
         for index in (n for n, shot in enumerate(plan.shots) if shot.pointing == pointing):
             window = _window(sky, index)
             hidden = _hidden(sky, index, window)
             slopes = np.stack(
-                [whole[name][window] - _through(total_slopes[name], hidden) for name in PARAMETERS]
+                [whole[name][window] - seen_through(total_slopes[name], hidden) for name in PARAMETERS]
             )
-            expected = sky.seen_scenes[pointing][window] - _through(sky.kernel, hidden)
+            expected = sky.seen_scenes[pointing][window] - seen_through(sky.kernel, hidden)
             dark = fully_dark(plan.place(index), _first(window), hidden.shape)
             variance = plan.noise.variance(expected[dark], plan.shots[index].exposure_s)  # Eq. (2)
             information += (slopes[:, dark] / variance) @ slopes[:, dark].T  # Eq. (1)
@@ -163,12 +164,12 @@ def _place_bound(sky: TrueSky, index: int) -> tuple[float, float]:
     plan, shot = sky.plan, sky.plan.shots[index]
     place, window = plan.place(index), _window(sky, index)
     hidden = _hidden(sky, index, window)
-    expected = sky.seen_scenes[shot.pointing][window] - _through(sky.kernel, hidden)
+    expected = sky.seen_scenes[shot.pointing][window] - seen_through(sky.kernel, hidden)
     by_place = []
     for slope in sky.behind[index].hidden_slopes(place):
         moved = np.zeros_like(hidden)
         moved[_inside(sky, index, window)] = slope
-        by_place.append(-_through(sky.kernel, moved))  # Eq. (3)
+        by_place.append(-seen_through(sky.kernel, moved))  # Eq. (3)
     top, left = _first(window)
     y, x = np.mgrid[top : top + hidden.shape[0], left : left + hidden.shape[1]]
     used = np.hypot(x - place.x_px, y - place.y_px) <= place.radius_px + PLACE_MARGIN_PX
@@ -220,18 +221,6 @@ def _inverse(information: Plane) -> Plane:
             "expected dark pixels that distinguish the parameters; got a singular matrix. Use more images or larger discs",
         )
     return np.asarray(np.linalg.inv(correlation) / np.outer(scale, scale))
-
-
-def _seen(scene: Plane, kernel: Kernel, margin_px: int, threads: int) -> Plane:
-    shape = (scene.shape[0], scene.shape[1])
-    through = Convolver(kernel, shape, dtype=np.float64, threads=threads).apply(scene)
-    return on_field(np.asarray(through, dtype=np.float64), margin_px)
-
-
-def _through(kernel: Kernel, patch: Plane) -> Plane:
-    """Convolve a patch with a kernel. The result covers the same pixels as the patch."""
-    shape = (patch.shape[0], patch.shape[1])
-    return np.asarray(Convolver(kernel, shape, dtype=np.float64).apply(patch), dtype=np.float64)
 
 
 def _window(sky: TrueSky, index: int) -> Window:

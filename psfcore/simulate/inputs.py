@@ -18,9 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from psfcore.arrays import Plane
 from psfcore.build import build_psf
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits
@@ -43,8 +41,6 @@ from psfcore.simulate.plan import (
 from psfcore.simulate.scene import scene_from_image
 from psfcore.transit.folder import times_s
 from psfcore.transit.manifest import MANIFEST_NAME, MAX_MANIFEST_BYTES, TransitManifest, parse_manifest
-
-Plane = NDArray[np.float64]
 
 LARGEST_DIFFRACTION_PX = 2048
 LARGEST_SIZE_PX = 4096
@@ -129,13 +125,12 @@ def _of_transit(
     manifest: TransitManifest, content: Mapping[str, Any], folder: Path, limits: FitsLimits
 ) -> Plan:
     """The plan of a transit whose images may not be taken yet."""
-    there = [(folder / image.file).is_file() for image in manifest.images]
-    if any(there) and not all(there):
-        missing = [image.file for image, is_there in zip(manifest.images, there, strict=True) if not is_there]
+    missing = [image.file for image in manifest.images if not (folder / image.file).is_file()]
+    if 0 < len(missing) < len(manifest.images):
         raise _bad(
             f"{MANIFEST_NAME}: expected all images in the folder, or none of them; missing: {', '.join(missing[:5])}"
         )
-    if all(there):
+    if not missing:
         headers = [read_summary(folder / image.file, limits) for image in manifest.images]
         size_px, exposures = _size_of_headers(headers), _exposures_of_headers(headers, manifest)
     else:
@@ -255,8 +250,10 @@ def scenes_from_files(files: Sequence[Path], plan: Plan, limits: FitsLimits) -> 
     if not files:
         return None
     if len(files) not in (1, len(plan.views)):
-        message = f"expected one scene image, or {len(plan.views)} (one for each pointing); got {len(files)}"
-        raise DataError("scene-count", message)
+        raise DataError(
+            "scene-count",
+            f"expected one scene image, or {len(plan.views)} (one for each pointing); got {len(files)}",
+        )
     scenes = {}
     for pointing in plan.pointings:
         rate = image_rate(files[(pointing - 1) % len(files)], limits)

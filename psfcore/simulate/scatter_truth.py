@@ -24,13 +24,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from psfcore.arrays import Kernel
 from psfcore.convolution.convolver import linear_convolve
 from psfcore.errors import DataError
 from psfcore.psf import REACH_GRID_PX, crop_centred
 
-Kernel = NDArray[np.float64]
 PARAMETERS = ("b", "c", "total", "stretch")
 
 

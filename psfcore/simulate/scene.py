@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, zoom
 
+from psfcore.arrays import Kernel, Plane
 from psfcore.convolution.convolver import Convolver
 from psfcore.errors import DataError
 from psfcore.fits.images import write_image
@@ -25,8 +25,6 @@ from psfcore.image import Image
 from psfcore.noise import Noise
 from psfcore.psf import Psf
 from psfcore.simulate.plan import CAMERA, DISC, EAST, WEST, Plan
-
-Plane = NDArray[np.float64]
 
 QUIET_DN_PER_S = 420.0
 SKY_DN_PER_S = 12.0
@@ -300,8 +298,14 @@ def _filament(x: Plane, y: Plane) -> Plane:
     return np.asarray(ends * np.exp(-(((y - spine) / 0.013) ** 2)))
 
 
+def seen_through(kernel: Kernel, scene: Plane, *, threads: int = 1) -> Plane:
+    """A scene [y, x] convolved with a kernel, on the pixels of the scene, which is dark outside them."""
+    field = (scene.shape[0], scene.shape[1])
+    return np.asarray(Convolver(kernel, field, dtype=np.float64, threads=threads).apply(scene), np.float64)
+
+
 def observe(
-    scene: NDArray[np.float64],
+    scene: Plane,
     psf: Psf,
     *,
     exposure_s: float,
@@ -309,17 +313,16 @@ def observe(
     read_noise_dn: float,
     seed: int,
     threads: int = 1,
-) -> NDArray[np.float64]:
+) -> Plane:
     """Convolve `scene` [y, x] with the PSF, then add photon noise and read noise; both arrays are in DN/s.
 
     The scene is assumed dark outside its array. If photon_gain_dn and read_noise_dn are 0, the image is noise-free.
     """
-    field = (scene.shape[0], scene.shape[1])
-    seen = Convolver(psf.kernel, field, dtype=np.float64, threads=threads).apply(scene)
+    seen = seen_through(psf.kernel, scene, threads=threads)
     if photon_gain_dn == read_noise_dn == 0:
         return np.maximum(seen, 0.0)  # rounding in the transforms makes some dark pixels slightly negative
     noise = Noise(photon_gain_dn, read_noise_dn)
-    return noise.observe(np.asarray(seen), exposure_s, np.random.default_rng(seed))
+    return noise.observe(seen, exposure_s, np.random.default_rng(seed))
 
 
 def demo_image(path: str | Path, psf: Psf, *, size: int = 1024, seed: int = 1) -> None:

@@ -31,18 +31,15 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from psfcore.arrays import Flags, Kernel, Plane, squares
 from psfcore.convolution.convolver import Convolver
 from psfcore.errors import DataError
 from psfcore.psf import REACH_GRID_PX
 from psfcore.simulate.plan import Plan
 from psfcore.simulate.scatter_truth import ScatterTruth, total_kernel
-from psfcore.simulate.scene import drawn_scene
+from psfcore.simulate.scene import drawn_scene, seen_through
 from psfcore.transit.transit import Place
-
-Plane = NDArray[np.float64]
-Kernel = NDArray[np.float64]
 
 _SUM_TOLERANCE = 1e-3
 _PLACE_STEP_PX = 1e-3
@@ -109,10 +106,8 @@ def true_sky(
             around[index] = behind(fine, plan.place(index), fine=plan.oversampling, margin_px=plan.margin_px)
         coarse[pointing] = binned(fine, plan.oversampling)
         del fine
-        through = Convolver(kernel, (whole_px, whole_px), dtype=np.float64, threads=threads)
-        seen[pointing] = on_field(
-            np.asarray(through.apply(coarse[pointing]), dtype=np.float64), plan.margin_px
-        ).copy()
+        whole = seen_through(kernel, coarse[pointing], threads=threads)
+        seen[pointing] = on_field(whole, plan.margin_px).copy()
     return TrueSky(
         plan=plan,
         scatter=scatter,
@@ -197,7 +192,7 @@ def _half_segment(x: Plane, r: float) -> Plane:
     return np.asarray((x * root + r**2 * np.arcsin(np.clip(x / r, -1, 1))) / 2)
 
 
-def fully_dark(place: Place, first: tuple[int, int], shape: tuple[int, int]) -> NDArray[np.bool_]:
+def fully_dark(place: Place, first: tuple[int, int], shape: tuple[int, int]) -> Flags:
     """True for pixels [y, x] whose four corners all lie inside the disc. first, shape: see covered_share."""
     y = np.abs(first[0] + np.arange(shape[0]) - place.y_px) + 0.5
     x = np.abs(first[1] + np.arange(shape[1]) - place.x_px) + 0.5
@@ -262,5 +257,4 @@ def binned(fine_plane: Plane, fine: int) -> Plane:
     """The mean of each block of (fine, fine) pixels."""
     if fine == 1:
         return fine_plane
-    ny, nx = fine_plane.shape
-    return np.asarray(fine_plane.reshape(ny // fine, fine, nx // fine, fine).mean(axis=(1, 3)))
+    return np.asarray(squares(fine_plane, fine).mean(axis=(1, 3)))

@@ -41,6 +41,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.arrays import Kernel, Plane
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.images import CardValue, read_plane, write_plane
@@ -50,9 +51,6 @@ from psfcore.simulate.scatter_truth import ScatterTruth
 from psfcore.simulate.sky import TrueSky, true_sky
 from psfcore.transit.manifest import MANIFEST_NAME
 from psfcore.transit.transit import Frame, Place, Transit
-
-Plane = NDArray[np.float64]
-Kernel = NDArray[np.float64]
 
 TRUTH_FILE = "truth.json"
 DIFFRACTION_FILE = "diffraction.fits"
@@ -322,9 +320,10 @@ def read_sky(folder: str | Path, *, threads: int = 1) -> TrueSky:
     except (OSError, ValueError, KeyError, TypeError) as error:
         if isinstance(error, DataError):
             raise
-        expected = f"{TRUTH_FILE} in {folder.name}, as `heliopsf simulate transit` writes it"
         raise DataError(
-            "not-simulated", f"expected a file {expected}; got {type(error).__name__}: {error!s:.120}"
+            "not-simulated",
+            f"expected a file {TRUTH_FILE} in {folder.name}, as `heliopsf simulate transit` writes it; got "
+            f"{type(error).__name__}: {error!s:.120}",
         ) from None
     plan = plan_from_json(plan_json)
     limits = FitsLimits(max_pixels=_LARGEST_PX**2)

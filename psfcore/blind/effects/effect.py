@@ -29,8 +29,7 @@ from numpy.typing import NDArray
 from psfcore.simulate.plan import Plan, Shot
 
 Plane = NDArray[np.float64]
-Change = Callable[..., Any]
-Function = TypeVar("Function", bound=Change)
+Function = TypeVar("Function", bound=Callable[..., Any])
 # How a parameter is drawn: a function, or the ends of the interval of a uniform distribution.
 Draw = Callable[[Plan, np.random.Generator], Any] | tuple[float, float]
 
@@ -52,7 +51,7 @@ _FAMILIES = {
 }
 STAGES = {family: stage for stage, families in _FAMILIES.items() for family in families}
 ANGLE = (0.0, 360.0)  # degrees
-# Options of kinds (`Kind`).
+# Options of kinds (`EffectKind`).
 ADDS_LIGHT, DEPENDS_ON_NOISE, VARIES = {"adds_light": True}, {"noise_realisations": 12}, {"varies": True}
 
 
@@ -84,7 +83,7 @@ class Earlier:
 
 
 @dataclass(frozen=True)
-class Kind:
+class EffectKind:
     """A kind of effect: the function `change` changes a step of the simulation.
 
     group: one of KNOWN, CALIBRATION, TEST. families: the families of causes that are a right answer, the main one
@@ -105,7 +104,7 @@ class Kind:
     unit: str
     nominal: float
     largest: float
-    change: Change
+    change: Callable[..., Any]
     draw: Mapping[str, Draw]
     power: float = 1.0
     varies: bool = False
@@ -124,7 +123,7 @@ class Kind:
         return Effect(self, self.nominal, parameters)
 
 
-EFFECTS: dict[str, Kind] = {}
+EFFECTS: dict[str, EffectKind] = {}
 
 
 def declare(
@@ -137,12 +136,12 @@ def declare(
     options: Mapping[str, Any] | None = None,
     **draw: Draw,
 ) -> Callable[[Function], Function]:
-    """Add the decorated function to EFFECTS, under its own name. options: further fields of `Kind`. draw: its
+    """Add the decorated function to EFFECTS, under its own name. options: further fields of `EffectKind`. draw: its
     parameters."""
 
     def add(change: Function) -> Function:
         name = change.__name__
-        EFFECTS[name] = Kind(
+        EFFECTS[name] = EffectKind(
             name, group, step, families, unit, nominal, largest, change, draw, **(options or {})
         )
         return change
@@ -154,7 +153,7 @@ def declare(
 class Effect:
     """An effect: its kind, its strength and its parameters, by name."""
 
-    kind: Kind
+    kind: EffectKind
     strength: float
     parameters: Mapping[str, Any]
 

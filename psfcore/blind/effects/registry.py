@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from psfcore.blind.effects import detector, effect, optics, scene, withheld
-from psfcore.blind.effects.effect import EFFECTS, Kind
+from psfcore.blind.effects.effect import EFFECTS, EffectKind
 from psfcore.errors import DataError
 
 # An import of these files declares their effects.
@@ -18,7 +18,7 @@ KNOWN = _names_of(effect.KNOWN)  # effects that the gap library also contains, b
 WITHHELD = {group: _names_of(group) for group in (effect.CALIBRATION, effect.TEST)}
 
 
-def effect_named(name: str) -> Kind:
+def effect_named(name: str) -> EffectKind:
     """The effect with this name. Raises DataError "unknown-effect"."""
     if name not in EFFECTS:
         raise DataError("unknown-effect", f"expected one of {', '.join(sorted(EFFECTS))}; got {name!r}")

@@ -24,8 +24,8 @@ from psfcore.drawing.plots import (
     CHANGE_LIMIT_PCT,
     GOLD,
     INK,
+    AxesBounds,
     Panel,
-    Place,
     binned,
     change_pct,
     compared_panels,
@@ -88,7 +88,7 @@ def changes_png(
     write_png(figure, path, pil_kwargs={"compress_level": 3})
 
 
-def _place(index: int) -> Place:
+def _place(index: int) -> AxesBounds:
     row, column = divmod(index, 3)
     return 0.045 + 0.318 * column, 0.555 - 0.465 * row, 0.266, 0.38
 

@@ -26,7 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.gap.view import Matrix, Vector
+from psfcore.arrays import Flags, Matrix, Vector, squares
 from psfcore.scatter.reconstruction import Solution
 from psfcore.scatter.total_psf import Optics, Pixels, put
 
@@ -63,7 +63,7 @@ def cells_of(dark: Pixels, x_px: float, y_px: float) -> Cells:
     r = np.hypot(dx, dy)
     share = r / max(float(r.max()), 1e-9)
     angle = np.arctan2(dy, dx)
-    members: list[NDArray[np.bool_]] = []
+    members: list[Flags] = []
     for low, high, sectors in RINGS:
         ring = (share >= low) & ((share < high) | (high >= 1.0))
         sector = np.floor((angle + np.pi / sectors) / (2 * np.pi / sectors)).astype(int) % sectors
@@ -195,10 +195,7 @@ def box_px(shape: tuple[int, ...]) -> int:
 
 def summed_over_boxes(planes: Planes) -> Planes:
     """The sums of planes (planes, y, x) over boxes. Incomplete boxes at the last rows and columns are left out."""
-    edge = box_px(planes.shape)
-    rows, columns = (n // edge for n in planes.shape[1:])
-    cut = planes[:, : rows * edge, : columns * edge]
-    return np.asarray(cut.reshape(-1, rows, edge, columns, edge).sum(axis=(2, 4)))
+    return np.asarray(squares(planes, box_px(planes.shape)).sum(axis=(2, 4)))
 
 
 def coarse_kernel(kernel: Matrix, step: int) -> Matrix:

@@ -40,12 +40,11 @@ from numpy.typing import NDArray
 from scipy.linalg import cholesky, solve_triangular
 from scipy.special import log_ndtr, logsumexp
 
-from psfcore.arrays import scaled_inverse
+from psfcore.arrays import Flags, Matrix, Vector, scaled_inverse
 from psfcore.gap.evidence.columns import LIKELY, FieldColumns
 from psfcore.gap.evidence.linear_model import WEAKEST, LinearModel
 from psfcore.gap.evidence.tree import SUN, Field, family_of, fields_of
 from psfcore.gap.evidence.unocculted_blocks import LEAST_IMAGES
-from psfcore.gap.view import Matrix, Vector
 
 Columns = NDArray[np.intp]
 Sun = tuple[str, float]  # the course and the size of the Sun in the model
@@ -76,7 +75,7 @@ class Form:
     field: Field | None
     columns: Columns
     likely: Vector
-    positive: NDArray[np.bool_]
+    positive: Flags
     scales: tuple[float, ...] = SCALES
     squares: tuple[Columns, ...] = ()
     everywhere: bool = True
@@ -444,7 +443,7 @@ class ClosedForm:
         return float(left @ left) / discs, max(float(of_blocks), 0.0) / max(self._block_count, 1)
 
 
-def _joined(variants: Sequence[Variant]) -> tuple[Columns, Vector, NDArray[np.bool_], Columns]:
+def _joined(variants: Sequence[Variant]) -> tuple[Columns, Vector, Flags, Columns]:
     """Columns, widths and signs of several variants, and for each column the number of its variant."""
     return (
         np.concatenate([one.columns for one in variants]),

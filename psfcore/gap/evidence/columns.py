@@ -40,12 +40,12 @@ from functools import cached_property, partial
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.arrays import Matrix, Vector
 from psfcore.convolution.convolver import Convolver, linear_convolve
 from psfcore.gap.effect import Change, Effect, EffectParameter
 from psfcore.gap.evidence.cells import DiscCells
 from psfcore.gap.evidence.responses import Evidence
 from psfcore.gap.evidence.tree import FAMILIES, WIDTHS, Field
-from psfcore.gap.view import Matrix, Vector
 
 LIKELY = 0.02  # likely relative size of a coefficient; the evidence also tries ten times this size
 KERNEL_LIKELY, OUTSIDE_LIKELY = (

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtrc
 
+from psfcore.arrays import Vector
 from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.linear_model import LinearModel, Step
-from psfcore.gap.view import Vector
 
 # Chi2 of the unocculted field may exceed its degrees of freedom by this fraction without a gap: the Sun always changes a little.
 UNOCCULTED_WIDTH = 0.03

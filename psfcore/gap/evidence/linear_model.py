@@ -33,10 +33,9 @@ from functools import cached_property
 
 import numpy as np
 
-from psfcore.arrays import scaled_inverse
+from psfcore.arrays import Matrix, Vector, scaled_inverse
 from psfcore.gap.evidence.cells import whitening
 from psfcore.gap.evidence.responses import Evidence
-from psfcore.gap.view import Matrix, Vector
 
 FLOOR = 0.003  # f of Eq. (2)
 UNLIKELY = 10.0  # width of the prior of a parameter, in units of its likely size

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psfcore.gap.view import Vector
+from psfcore.arrays import Vector, squares
 from psfcore.noise import Noise
 from psfcore.transit.transit import Frame, Transit
 
@@ -70,12 +70,10 @@ def _blocks(one: Frame, other: Frame) -> tuple[Vector, Vector]:
     """Level (DN) and variance (DN^2) of one exposure, for each block away from both discs: two arrays (blocks,)."""
     a, b = (frame.pixels.astype(np.float64) * frame.exposure_s for frame in (one, other))
     difference = a - b * (a.mean() / b.mean())
-    ny, nx = (n // 2 * 2 for n in difference.shape)
-    quads = difference[:ny, :nx].reshape(ny // 2, 2, nx // 2, 2)
+    quads = squares(difference, 2)
     h = (quads[:, 0, :, 0] - quads[:, 0, :, 1] - quads[:, 1, :, 0] + quads[:, 1, :, 1]) / 2  # Eq. (1)
-    level = ((a + b) / 2)[:ny, :nx].reshape(ny // 2, 2, nx // 2, 2).mean(axis=(1, 3))
     rows, columns = (n // BLOCK for n in h.shape)
-    h, level = (p[: rows * BLOCK, : columns * BLOCK].reshape(rows, BLOCK, columns, BLOCK) for p in (h, level))
+    h, level = (squares(p, BLOCK) for p in (h, squares((a + b) / 2, 2).mean(axis=(1, 3))))
     spread = NORMAL_MAD * np.median(np.abs(h), axis=(1, 3))
     y, x = ((np.arange(n) * 2 + 1) * BLOCK for n in (rows, columns))
     away = np.ones((rows, columns), dtype=bool)
@@ -83,8 +81,7 @@ def _blocks(one: Frame, other: Frame) -> tuple[Vector, Vector]:
         reach = frame.place.radius_px + FREE_OF_DISC_PX
         away &= np.maximum(np.abs(y[:, None] - frame.place.y_px), np.abs(x - frame.place.x_px)) > reach
         if frame.filled is not None:
-            filled = frame.filled[: rows * 2 * BLOCK, : columns * 2 * BLOCK]
-            away &= ~filled.reshape(rows, 2 * BLOCK, columns, 2 * BLOCK).any(axis=(1, 3))
+            away &= ~squares(frame.filled, 2 * BLOCK).any(axis=(1, 3))
     return level.mean(axis=(1, 3))[away], (spread**2 / 2)[away]
 
 

@@ -15,8 +15,8 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from psfcore.arrays import Flags, Matrix, Vector
 from psfcore.gap.effect import Change, Effect
 from psfcore.gap.evidence.cells import (
     DiscCells,
@@ -32,7 +32,7 @@ from psfcore.gap.evidence.unocculted_blocks import (
     blocks,
     unocculted_blocks,
 )
-from psfcore.gap.view import Matrix, Vector, View
+from psfcore.gap.view import View
 from psfcore.scatter.reconstruction import Progress, Solution
 from psfcore.scatter.total_psf import Blur
 from psfcore.transit.occulter import UNDESCRIBED
@@ -68,8 +68,8 @@ class Prior:
     """
 
     likely: Vector
-    positive: NDArray[np.bool_]
-    field: NDArray[np.bool_]
+    positive: Flags
+    field: Flags
 
 
 @dataclass(frozen=True, eq=False)

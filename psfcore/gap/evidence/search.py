@@ -36,11 +36,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from psfcore.arrays import Matrix, Vector, cut
 from psfcore.convolution.convolver import correlations
 from psfcore.gap.evidence.cells import cells_of, coarse_kernel, sensitivities, whitening
 from psfcore.gap.evidence.linear_model import FLOOR
 from psfcore.gap.evidence.unocculted_blocks import block_means
-from psfcore.gap.view import Field, Matrix, Vector, View
+from psfcore.gap.view import Field, View
 from psfcore.psf import crop_or_pad
 from psfcore.scatter.total_psf import Optics
 
@@ -288,13 +289,3 @@ def _at_displacements(plane: Matrix, image: Matrix) -> Matrix:
 def displaced(plane: Any, dx: int, dy: int) -> Any:
     """A plane [y, x], moved by whole pixels. Pixels to which no pixel of the plane moves are 0."""
     return cut(plane, -dy, -dx, plane.shape)
-
-
-def cut(plane: Any, top: int, left: int, size: tuple[int, int]) -> Any:
-    """A window of a plane [y, x]; its pixels outside the plane are 0."""
-    out = np.zeros(size, plane.dtype)
-    low_y, high_y = (min(max(at, 0), plane.shape[0]) for at in (top, top + size[0]))
-    low_x, high_x = (min(max(at, 0), plane.shape[1]) for at in (left, left + size[1]))
-    if low_y < high_y and low_x < high_x:
-        out[low_y - top : high_y - top, low_x - left : high_x - left] = plane[low_y:high_y, low_x:high_x]
-    return out

@@ -21,7 +21,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.gap.view import Matrix, Vector, View
+from psfcore.arrays import Flags, Matrix, Vector, squares
+from psfcore.gap.view import View
 from psfcore.scatter.reconstruction import Progress
 from psfcore.transit.occulter import disc_distance
 
@@ -49,12 +50,12 @@ class UnoccultedBlocks:
 
     levels: Matrix
     variance: Matrix
-    free: NDArray[np.bool_]
+    free: Flags
     means: Matrix
-    errors: NDArray[np.float64]
+    errors: Matrix
     pointing: NDArray[np.int64]
     kind: NDArray[np.int64]
-    part: NDArray[np.bool_]
+    part: Flags
     across: int
     given_gain_width: float | None = None
 
@@ -120,40 +121,29 @@ class UnoccultedBlocks:
             gains=gains,
         )
 
-    def held_out(
-        self, columns: Sequence[int], images: Sequence[int], fitted: Sequence[int]
-    ) -> tuple[Vector, Matrix]:
-        """Held-out images minus the scene of the fitted images, and the Jacobian of this difference, in units of the noise.
+    def held_out(self, columns: Sequence[int], n: int, fitted: Sequence[int]) -> tuple[Vector, Matrix]:
+        """The held-out image n minus the scene of the fitted images, and the Jacobian of this difference, in units of the noise.
 
-        images: the held-out images. fitted: the images that give the scene. The two results have the shapes (n,) and
-        (columns, n). For each held-out image they contain the values of its blocks, followed by its brightness in units of
-        `gain_width`.
+        fitted: the images that give the scene. The two results have the shapes (values,) and (columns, values). They contain
+        the values of the blocks, followed by the brightness in units of `gain_width`; nothing if the scene is not known.
         """
-        errors, weights = self.errors[list(columns)], self._weights
-        residuals, jacobians = [np.zeros(0)], [np.zeros((len(columns), 0))]
-        for n in images:
-            others = [k for k in fitted if self.pointing[k] == self.pointing[n] and self.part[k]]
-            if not self.part[n] or len(others) < LEAST_IMAGES - 1:
-                continue
-            here, weight = np.array(others), weights[others]
-            total = weight.sum(axis=0)
-            use = self.free[n] & ((weight > 0).sum(axis=0) >= LEAST_IMAGES - 1)
-            if not use.any():
-                continue
-            w = 1 / (self.variance[n, use] + 1 / total[use])
-            mean = self.means[n, use]
+        errors = self.errors[list(columns)]
+        here = [k for k in fitted if self.pointing[k] == self.pointing[n] and self.part[k]]
+        weight = self._weights[here]
+        use = self.free[n] & ((weight > 0).sum(axis=0) >= LEAST_IMAGES - 1)
+        if not (self.part[n] and use.any()):
+            return np.zeros(0), np.zeros((len(columns), 0))
+        total, mean = weight.sum(axis=0), self.means[n, use]
+        w = 1 / (self.variance[n, use] + 1 / total[use])
 
-            def in_noise(differing: Matrix, w: Vector = w, mean: Vector = mean) -> Matrix:
-                along = (w * mean * differing).sum(axis=-1) / ((w * mean**2).sum() + 1 / self.gain_width**2)
-                steady = np.sqrt(w) * (differing - along[..., None] * mean)
-                return np.concatenate([steady, along[..., None] / self.gain_width], axis=-1)
+        def in_noise(differing: Matrix) -> Matrix:
+            along = (w * mean * differing).sum(axis=-1) / ((w * mean**2).sum() + 1 / self.gain_width**2)
+            steady = np.sqrt(w) * (differing - along[..., None] * mean)
+            return np.concatenate([steady, along[..., None] / self.gain_width], axis=-1)
 
-            scene = (self.levels[here] * weight).sum(axis=0)[use] / total[use]
-            residuals.append(in_noise(self.levels[n, use] - scene))
-            jacobians.append(
-                in_noise(errors[:, n, use] - (errors[:, here] * weight).sum(axis=1)[:, use] / total[use])
-            )
-        return np.concatenate(residuals), np.concatenate(jacobians, axis=1)
+        scene = (self.levels[here] * weight).sum(axis=0)[use] / total[use]
+        changed = (errors[:, here] * weight).sum(axis=1)[:, use] / total[use]
+        return in_noise(self.levels[n, use] - scene), in_noise(errors[:, n, use] - changed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,9 +170,7 @@ def block_px(shape: tuple[int, int]) -> int:
 
 def block_means(plane: NDArray[np.floating], edge: int) -> Matrix:
     """The means of a plane [y, x] over squares of `edge` px. Incomplete squares in the last rows and columns are dropped."""
-    rows, columns = (n // edge for n in plane.shape)
-    cut = plane[: rows * edge, : columns * edge]
-    return np.asarray(cut.reshape(rows, edge, columns, edge).mean(axis=(1, 3), dtype=np.float64))
+    return np.asarray(squares(plane, edge).mean(axis=(1, 3), dtype=np.float64))
 
 
 def blocks(plane: NDArray[np.floating]) -> Vector:

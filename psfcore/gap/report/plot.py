@@ -16,15 +16,14 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Wedge
-from numpy.typing import NDArray
 
+from psfcore.arrays import Flags, Plane, Vector
 from psfcore.drawing.page import PLOT_DPI
 from psfcore.drawing.plots import CHANGE, INK, png_of, tidy
 from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.evidence.cells import RINGS, DiscCells
 from psfcore.gap.report.report import fits_of, percent_words
 
-Vector = NDArray[np.float64]
 Report = dict[str, Any]
 
 WIDTH_IN = 9.9
@@ -78,13 +77,12 @@ def draw_residuals(figure: Any, report: Report) -> None:
     for axes, (label, at) in zip(charts, along, strict=True):
         axes.axhline(0, color="#555555", linewidth=1.0)
         for here, colour, symbol in looks.values():
-            style: dict[str, Any] = {"fmt": symbol, "color": colour}
             for what, more in (
                 ("", {"ms": 5, "elinewidth": 1.1, "mew": 0}),
                 ("after_", {"ms": 4.5, "elinewidth": 0.5, **hollow}),
             ):
                 residual, noise = (_column(rows, f"{name}_{what}pct") for name in ("residual", "noise"))
-                axes.errorbar(at[here], residual[here], noise[here], **style, **more)
+                axes.errorbar(at[here], residual[here], noise[here], fmt=symbol, color=colour, **more)
         axes.set(xlabel=label)
     charts[0].set(ylabel="Simulated - observed (%)")
     entries: list[dict[str, Any]] = [
@@ -124,8 +122,18 @@ def draw_map(figure: Any, report: Report) -> None:
     for axes, values in zip(charts, (before, _column(rows, "residual_after_pct")), strict=False):
         for fov, (here, _, symbol) in _looks(rows).items():
             here = here & np.isfinite(values)
-            style = {"marker": symbol, "s": 62, "edgecolors": "#444444", "linewidths": 0.6}
-            drawn = axes.scatter(x[here], y[here], c=values[here], cmap=CHANGE, vmin=-top, vmax=top, **style)
+            drawn = axes.scatter(
+                x[here],
+                y[here],
+                s=62,
+                c=values[here],
+                marker=symbol,
+                cmap=CHANGE,
+                vmin=-top,
+                vmax=top,
+                edgecolors="#444444",
+                linewidths=0.6,
+            )
             axes.plot([], [], symbol, color="#777777", ms=7, label=f"pointing {fov}")
         axes.set(xlim=(-0.5, nx - 0.5), ylim=(-0.5, ny - 0.5), aspect="equal", xlabel="Detector x (px)")
     charts[0].set(ylabel="Detector y (px)")
@@ -195,9 +203,16 @@ def draw_cells(figure: Any, found: Diagnosis) -> None:
             colour = CHANGE((share + 1) / 2)
             axes.add_patch(Wedge((0, 0), high, *ends, width=high - low, fc=colour, ec="white", lw=1.0))
             angle, middle = np.radians(sector * 360 / sectors), (low + high) / 2 if low else 0.0
-            style = {"color": "white" if abs(share) > _DARK else INK, "fontsize": 8, "linespacing": 1.05}
-            place = middle * np.cos(angle), middle * np.sin(angle)
-            axes.text(*place, f"{mean:+.1f}\n±{error:.1f}", ha="center", va="center", **style)
+            axes.text(
+                middle * np.cos(angle),
+                middle * np.sin(angle),
+                f"{mean:+.1f}\n±{error:.1f}",
+                ha="center",
+                va="center",
+                color="white" if abs(share) > _DARK else INK,
+                fontsize=8,
+                linespacing=1.05,
+            )
         axes.add_patch(Circle((0, 0), 1.0, fc="none", ec="#555555", lw=1.0))
         axes.set(
             xlim=(-1.05, 1.05),
@@ -297,7 +312,7 @@ def largest_residual(found: Diagnosis) -> int:
     return found.evidence.discs[int(np.argmax(size))].index
 
 
-def simulated_of(found: Diagnosis, n: int, *, with_answer: bool = False) -> NDArray[np.float64]:
+def simulated_of(found: Diagnosis, n: int, *, with_answer: bool = False) -> Plane:
     """The model image of image n [y, x], DN/s. with_answer: whether to add the change by the named effects."""
     raw = found.solution.transit.frames[n].pixels
     solution = found.corrected.solution if with_answer and found.corrected else found.solution
@@ -337,7 +352,7 @@ def _column(rows: Sequence[dict[str, Any]], name: str) -> Vector:
     return np.array([np.nan if row[name] is None else row[name] for row in rows], dtype=np.float64)
 
 
-def _looks(rows: Sequence[dict[str, Any]]) -> dict[int, tuple[NDArray[np.bool_], str, str]]:
+def _looks(rows: Sequence[dict[str, Any]]) -> dict[int, tuple[Flags, str, str]]:
     """For each pointing: which images belong to it (images,), its colour and its symbol."""
     pointing = _column(rows, "fov")
     looks = itertools.cycle(zip(_COLOURS, _SYMBOLS, strict=True))

@@ -177,7 +177,7 @@ def answer_of(model: LinearModel, level: float) -> Answer:
         weighed = _Weighed(weighed.closed)
     weighed.closed.forget_suns()
     shares = weighed.probabilities()
-    by_label = _sum((frozenset(map(label_of, forms)), share) for forms, share in shares.items())
+    by_label = sums((frozenset(map(label_of, forms)), share) for forms, share in shares.items())
     causes = causes_of(by_label, level)
     return Answer(
         causes,
@@ -282,7 +282,7 @@ class _Weighed:
                     coherent[rest] = float(np.logaddexp(coherent.get(rest, -math.inf), raised))
                     coherent.pop(forms)
         each = [_without_idle(_normalised(one)) for one in (weights, coherent)]
-        return _sum((forms, share / 2) for one in each for forms, share in one.items())
+        return sums((forms, share / 2) for one in each for forms, share in one.items())
 
 
 def _may_act_together(one: Form, other: Form) -> bool:
@@ -317,7 +317,8 @@ def _without_idle(shares: Mapping[Hypothesis, float]) -> dict[Hypothesis, float]
     return out
 
 
-def _sum(pairs: Iterable[tuple[Key, float]]) -> dict[Key, float]:
+def sums(pairs: Iterable[tuple[Key, float]]) -> dict[Key, float]:
+    """The sum of the shares of each key."""
     out: dict[Key, float] = {}
     for key, share in pairs:
         out[key] = out.get(key, 0.0) + share
@@ -330,7 +331,7 @@ def _sorted(shares: Mapping[Key, float]) -> dict[Key, float]:
 
 def _of_labels(shares: Mapping[Labels, float]) -> dict[Label, float]:
     # Equally probable labels have the same order in every process.
-    return _sum((label, share) for labels, share in shares.items() for label in sorted(labels, key=str))
+    return sums((label, share) for labels, share in shares.items() for label in sorted(labels, key=str))
 
 
 def causes_of(shares: Mapping[Labels, float], level: float) -> tuple[Cause, ...]:
@@ -349,7 +350,7 @@ def causes_of(shares: Mapping[Labels, float], level: float) -> tuple[Cause, ...]
         found.append(
             Cause(tuple(Alternative(FAMILIES[one[0]], one[1], min(whole[one], 1.0)) for one in group))
         )
-        rest = _sum(
+        rest = sums(
             (labels - {next((x for x in group if x in labels), None)}, share)
             for labels, share in rest.items()
             if len(labels) > 1 or not labels & set(group)
@@ -383,7 +384,7 @@ def _settled(shares: Mapping[Labels, float]) -> dict[Labels, float]:
         if whole[best] >= whole[other]:
             becomes[other] = best
         becomes |= {label: other for label in names if whole[label] * BEATEN < whole[other]}
-    return _sum(
+    return sums(
         (frozenset(becomes.get(label, label) for label in labels), share) for labels, share in shares.items()
     )
 

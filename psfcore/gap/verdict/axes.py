@@ -22,10 +22,10 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtrc
 
+from psfcore.arrays import Matrix, Vector
 from psfcore.gap.evidence.cells import DiscCells
 from psfcore.gap.evidence.linear_model import LinearModel, Step
 from psfcore.gap.evidence.responses import Evidence, ImageInfo
-from psfcore.gap.view import Matrix, Vector
 
 SIGN_FLIPS = 999
 AS_GOOD = 0.3  # an axis of the best effect comes first if it explains at least this fraction of what the best axis explains

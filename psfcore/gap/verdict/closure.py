@@ -36,8 +36,8 @@ from typing import Any
 
 import numpy as np
 
+from psfcore.arrays import Vector
 from psfcore.gap.evidence.linear_model import LinearModel
-from psfcore.gap.view import Vector
 from psfcore.transit.transit import Fold, folds
 
 RESAMPLES = 1000
@@ -132,7 +132,7 @@ def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold])
         for n in held:
             disc, white = evidence.discs[by_index[n]], model.discs[by_index[n]]
             left = white.residual - white.jacobian[here].T @ step.values
-            blocks, jacobian = evidence.unocculted.held_out(columns, [n], fitted)
+            blocks, jacobian = evidence.unocculted.held_out(columns, n, fitted)
             blocks = (blocks - step.values[base:] @ jacobian) / unocculted_noise
             expected = max(blocks.size - 1, 0) + _error(jacobian, step.covariance[base:, base:])
             unchanged = np.zeros((base, blocks.size))  # the blocks do not depend on the PSF

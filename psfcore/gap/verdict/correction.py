@@ -16,14 +16,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from psfcore.arrays import Flags, Vector
 from psfcore.errors import DataError
 from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.effect_fits import EffectFit, fit_effects, label_of, left_chi2
 from psfcore.gap.evidence.linear_model import LinearModel
 from psfcore.gap.evidence.responses import Evidence, gather, residuals_at
-from psfcore.gap.view import Vector, View, return_unused_memory
+from psfcore.gap.view import View, return_unused_memory
 from psfcore.scatter.inversion import invert, solution_at
 from psfcore.scatter.reconstruction import Progress, Solution
 from psfcore.transit.transit import Transit
@@ -199,7 +199,7 @@ def _fit_remaining(model: LinearModel, held: Sequence[Effect], out: Vector) -> t
     return left, out + found
 
 
-def _those_that_act(effects: Sequence[Effect], acts: NDArray[np.bool_]) -> list[Effect]:
+def _those_that_act(effects: Sequence[Effect], acts: Flags) -> list[Effect]:
     """The effects, each with only those parameters for which `acts` is true.
 
     Raises DataError "effect-unseen" if an effect keeps no parameter.

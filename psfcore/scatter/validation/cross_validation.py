@@ -42,17 +42,15 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import TypeAdapter
 from scipy.special import ndtr
 
-from psfcore.arrays import json_attributes, json_values
+from psfcore.arrays import Matrix, Vector, json_attributes, json_values
 from psfcore.errors import DataError
 from psfcore.psf import cumulative_curve
 from psfcore.scatter.inversion import refit
 from psfcore.scatter.reconstruction import Progress, Solution
 from psfcore.scatter.segments import beyond_pct
-from psfcore.scatter.shapes import Vector
 from psfcore.scatter.validation.free_shells import FreeShares, free_shares, law_light, shells
 from psfcore.transit.transit import folds
 
@@ -114,8 +112,7 @@ class FoldFit:
     @staticmethod
     def from_json(content: dict[str, Any]) -> FoldFit:
         """The fit from the values of `to_json`."""
-        fit: FoldFit = _FOLD_FIT.validate_python(content)
-        return fit
+        return _FOLD_FIT.validate_python(content)
 
 
 _FOLD_FIT = TypeAdapter(FoldFit)
@@ -269,11 +266,11 @@ class ShellBands:
     """
 
     edges_px: Vector
-    free_weight: NDArray[np.float64]
-    law_weight: NDArray[np.float64]
-    free_beyond_pct: NDArray[np.float64]
-    law_beyond_pct: NDArray[np.float64]
-    excess_pct: NDArray[np.float64]
+    free_weight: Matrix
+    law_weight: Matrix
+    free_beyond_pct: Matrix
+    law_beyond_pct: Matrix
+    excess_pct: Matrix
     excess_sigma: Vector
     law_within_pct: Vector
 
@@ -316,7 +313,7 @@ class ShellBands:
         }
 
 
-def limits_json(limits: NDArray[np.float64]) -> dict[str, Any]:
+def limits_json(limits: Matrix) -> dict[str, Any]:
     """Percentiles at LIMITS by name."""
     return dict(zip(LIMIT_NAMES, limits.tolist(), strict=True))
 
@@ -350,7 +347,7 @@ class Bands:
     """
 
     radii_px: Vector
-    curve_pct: NDArray[np.float64]
+    curve_pct: Matrix
     values: dict[str, Vector]
     totals: Vector
     held_out_pct: dict[int, float]

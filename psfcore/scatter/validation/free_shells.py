@@ -40,17 +40,15 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
+from psfcore.arrays import Kernel, Matrix, Vector
 from psfcore.convolution.convolver import Convolver
 from psfcore.psf import REACH_GRID_PX
 from psfcore.scatter.reconstruction import Progress, Reconstruction
 from psfcore.scatter.segments import Segments, segment_sums, shells_as_published
-from psfcore.scatter.shapes import Shape, Vector
-from psfcore.scatter.total_psf import Blur, Kernel, pick
-
-Matrix = NDArray[np.float64]
+from psfcore.scatter.shapes import Shape
+from psfcore.scatter.total_psf import Blur, pick
 
 NEAR_PX = 100.0
 # Width of the prior divided by the formula's light in the shell: for shells within NEAR_PX, and for shells beyond.

@@ -35,19 +35,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from psfcore.arrays import Matrix, Vector
 from psfcore.errors import DataError
 from psfcore.psf import REACH_GRID_PX, cumulative_curve, radial_profile
 from psfcore.scatter.inversion import invert
 from psfcore.scatter.reconstruction import Inversion, Progress, Solution, labelled, on_threads
-from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW, Shape, Vector
+from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW, Shape
 from psfcore.scatter.total_psf import Blur, TotalPsf
 from psfcore.transit.transit import Transit, folds
 
 OFFSETS_DN = (-5.0, -3.0, 3.0, 5.0)
 _RADII = 48
-Matrix = NDArray[np.float64]
 BASE = len(SOFTENED_POWER_LAW.parameters)
 
 

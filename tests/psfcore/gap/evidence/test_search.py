@@ -12,12 +12,13 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, rotate
 
+from psfcore.arrays import cut
 from psfcore.convolution.convolver import correlations
 from psfcore.gap.evidence.cells import cells_of, sensitivities, whitening
 from psfcore.gap.evidence.effect_fits import fit_effects
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
 from psfcore.gap.evidence.responses import gather
-from psfcore.gap.evidence.search import NearDisc, cut, displaced, distinguished, near_discs, place_search
+from psfcore.gap.evidence.search import NearDisc, displaced, distinguished, near_discs, place_search
 from psfcore.gap.library.optics import ANGLES_DEG, BETWEEN_THEM, BLURS, DIRECTIONS, HALOS, blur_as
 from psfcore.gap.view import View
 from psfcore.psf import crop_or_pad
