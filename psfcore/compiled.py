@@ -40,7 +40,7 @@ from numba.core.caching import (
 )
 from numba.core.ccallback import CFunc
 from numba.core.dispatcher import Dispatcher
-from numba.core.runtime import rtsys
+from numba.core.runtime.nrt import rtsys
 
 from psfcore.files import CACHE_VARIABLE, cache_folder
 
@@ -70,7 +70,7 @@ def compiled(
         function.__qualname__ = name or function.__qualname__
         # Without the wrapper for callers in C: nothing calls it, and it takes time to compile.
         options.update(nogil=True, no_cfunc_wrapper=True)
-        kernel: Any = njit(**options)(function)
+        kernel: Callable[..., Any] = njit(**options)(function)
         if isinstance(kernel, Dispatcher):  # it is a plain function if compilation is switched off
             kernel._cache = KernelCache(function)  # type: ignore[attr-defined]
         return kernel

@@ -123,9 +123,9 @@ def block_means(pixels: Plane, rows: NDArray[np.intp], columns: NDArray[np.intp]
     finite = np.isfinite(pixels)
     if finite.all():
         heights, widths = np.diff(rows, append=pixels.shape[0]), np.diff(columns, append=pixels.shape[1])
-        return sums(pixels) / np.outer(heights, widths)
+        return np.asarray(sums(pixels) / np.outer(heights, widths))
     total, count = sums(np.where(finite, pixels, 0)), sums(finite)
-    return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
+    return np.asarray(np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0))
 
 
 def levels_of(pixels: Plane) -> NDArray[np.uint8]:

@@ -34,8 +34,8 @@ from psfcore.drawing.plots import (
     write_png,
 )
 from psfcore.errors import DataError
+from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.cards import optional_text
-from psfcore.fits.header import FitsLimits
 from psfcore.fits.images import read_planes
 from psfcore.fits.observation import read_observation
 
