@@ -7,7 +7,7 @@ import hashlib
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from astropy import units
@@ -75,18 +75,15 @@ class Deconvolution(Shown, Product):
 
     def plot(self, axes: Axes | None = None) -> Axes:
         """Draw the deconvolved image. Needs the extra "plot". axes None: new axes."""
-        drawn: Axes = module_of_extra("heliopsf.plots").draw_image(self, axes)
-        return drawn
+        return cast("Axes", module_of_extra("heliopsf.plots").draw_image(self, axes))
 
     def plot_change(self, axes: Axes | None = None) -> Axes:
         """Draw the change in percent of the input. Needs the extra "plot"."""
-        drawn: Axes = module_of_extra("heliopsf.plots").draw_change(self, axes)
-        return drawn
+        return cast("Axes", module_of_extra("heliopsf.plots").draw_change(self, axes))
 
     def quicklook(self) -> Figure:
         """A figure with the image before and after, and the change. Needs the extra "plot"."""
-        figure: Figure = module_of_extra("heliopsf.plots").before_and_after(self)
-        return figure
+        return cast("Figure", module_of_extra("heliopsf.plots").before_and_after(self))
 
 
 def in_form_of(image: Any, result: Deconvolution) -> Any:
@@ -157,7 +154,7 @@ def _uncertainty(result: Deconvolution) -> Any:
     return StdDevUncertainty(result.error)
 
 
-def _stored(plane: NDArray[Any]) -> NDArray[Any]:
+def _stored(plane: NDArray[np.generic]) -> NDArray[np.generic]:
     return plane.astype(np.float32) if plane.dtype.kind == "f" else plane
 
 

@@ -7,7 +7,7 @@ from dataclasses import fields, replace
 from datetime import datetime
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
 from astropy import units
@@ -72,7 +72,7 @@ class Psf(Shown, CorePsf):
     ``provenance``.
     """
 
-    def light_beyond(self, radii: ArrayLike | units.Quantity) -> NDArray[Any]:
+    def light_beyond(self, radii: ArrayLike | units.Quantity) -> NDArray[np.generic]:
         """1 - encircled energy: the light beyond each radius, in percent. radii: px, or quantities in px or angles."""
         return cumulative_curve(self.kernel, radii_px(radii, self.plate_scale_arcsec))
 
@@ -92,18 +92,15 @@ class Psf(Shown, CorePsf):
 
     def plot(self, axes: Axes | None = None, *, size: int = 129) -> Axes:
         """Draw the central ``size`` px on a logarithmic scale. Needs the extra "plot". axes None: new axes."""
-        drawn: Axes = module_of_extra("heliopsf.plots").draw_psf(self, axes, size=size)
-        return drawn
+        return cast("Axes", module_of_extra("heliopsf.plots").draw_psf(self, axes, size=size))
 
     def plot_curve(self, axes: Axes | None = None) -> Axes:
         """Draw 1 - encircled energy by radius, also of the components. Needs the extra "plot"."""
-        drawn: Axes = module_of_extra("heliopsf.plots").draw_curves(self, axes)
-        return drawn
+        return cast("Axes", module_of_extra("heliopsf.plots").draw_curves(self, axes))
 
     def quicklook(self) -> Figure:
         """A figure with the centre, the mean weight by radius and the light beyond a radius. Needs the extra "plot"."""
-        figure: Figure = module_of_extra("psfcore.drawing.plots").psf_figure(self)
-        return figure
+        return cast("Figure", module_of_extra("psfcore.drawing.plots").psf_figure(self))
 
     def lines(self) -> list[str]:
         """The PSF in two lines: which it is, and where its light is."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from heliopsf.parameters import NoiseFigures, Number, Stages, level_dn, noise_of, stage_reporter
 from heliopsf.psfs import Psf, build_psf
@@ -45,13 +45,11 @@ class ScatterFit(TransitFit):
 
     def plot(self, axes: Axes | None = None) -> Axes:
         """Draw the light beyond each radius with its error. Needs the extra "plot". axes None: new axes."""
-        drawn: Axes = module_of_extra("heliopsf.plots").draw_fit(self, axes)
-        return drawn
+        return cast("Axes", module_of_extra("heliopsf.plots").draw_fit(self, axes))
 
     def quicklook(self) -> Figure:
         """A figure with curves, residuals and convergence. Needs the extra "plot"."""
-        figure: Figure = module_of_extra("psfcore.scatter.plots").fit_figure(self)
-        return figure
+        return cast("Figure", module_of_extra("psfcore.scatter.plots").fit_figure(self))
 
 
 class GapDiagnosis(diagnose.Diagnosis):
@@ -69,8 +67,7 @@ class GapDiagnosis(diagnose.Diagnosis):
 
     def quicklook(self) -> Figure:
         """A figure with residuals, maps and effects. Needs the extra "plot"."""
-        figure: Figure = module_of_extra("psfcore.gap.report.plot").gap_figure(self, self.report())
-        return figure
+        return cast("Figure", module_of_extra("psfcore.gap.report.plot").gap_figure(self, self.report()))
 
 
 def fit_scatter(

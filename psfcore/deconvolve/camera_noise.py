@@ -57,7 +57,7 @@ _LOWEST = 0.75
 # Mean of this share of the absolute values of a normal distribution with variance 1.
 _LOWEST_MEAN = math.sqrt(2 / math.pi) * -math.expm1(-(ndtri((1 + _LOWEST) / 2) ** 2) / 2) / _LOWEST
 
-Plane = NDArray[np.floating[Any]]
+Plane = NDArray[np.floating]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -98,9 +98,9 @@ class Product(Deconvolved):
         return None if self.errors is None else self.errors.amplification
 
     @property
-    def planes(self) -> dict[str, NDArray[Any]]:
+    def planes(self) -> dict[str, NDArray[np.generic]]:
         """The planes of the product file by their names."""
-        planes: dict[str, NDArray[Any]] = {"QUALITY": self.assessed.quality}
+        planes: dict[str, NDArray[np.generic]] = {"QUALITY": self.assessed.quality}
         if self.errors is not None:
             planes["ERROR"] = self.errors.error
             if self.errors.psf_error is not None:

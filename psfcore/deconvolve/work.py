@@ -419,7 +419,7 @@ def _means(image: Image, factor: int) -> Plane:
     return np.where(count > 0, total / np.maximum(count, 1), total.sum() / count.sum())
 
 
-def _sums(plane: NDArray[Any], factor: int) -> Plane:
+def _sums(plane: NDArray[np.generic], factor: int) -> Plane:
     ny, nx = (-(-size // factor) for size in plane.shape)
     padded = np.zeros((ny * factor, nx * factor))
     padded[: plane.shape[0], : plane.shape[1]] = plane

@@ -19,7 +19,6 @@ from __future__ import annotations
 import struct
 import zlib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,7 +114,7 @@ def reduced(pixels: Plane) -> NDArray[np.float64]:
 def block_means(pixels: Plane, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.float64]:
     """Means of the finite pixels of the blocks that begin at these rows and columns; NaN for a block without any."""
 
-    def sums(plane: NDArray[Any]) -> NDArray[np.float64]:
+    def sums(plane: NDArray[np.generic]) -> NDArray[np.float64]:
         # The first sum is along the rows, because the pixels of a row lie one after the other in memory.
         narrow = np.add.reduceat(plane, columns, axis=1, dtype=np.float64)
         return np.asarray(np.add.reduceat(narrow, rows, axis=0))
