@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Annotated, Any, TypeVar, get_args
 
 from fastapi import APIRouter, Query, Request, Response
@@ -50,7 +50,6 @@ CORE_PX = 129
 FILTERS = ("instrument", "channel", "kind", "name", "version", "status", "valid_at")
 # Entries of the provenance that say when and where a PSF was made, not how.
 NOT_PARAMETERS = ("psf_id", "job_id", "file", "history", "instrument_toml")
-Tables = Mapping[str, Any]
 Thing = TypeVar("Thing")
 router = APIRouter(prefix="/psfs", include_in_schema=False)
 
@@ -306,7 +305,7 @@ def comparison(
     )
 
 
-def _compared(one: Tables, other: Tables) -> dict[str, Any]:
+def _compared(one: lookup.Tables, other: lookup.Tables) -> dict[str, Any]:
     """The curves of two PSFs at the radii that both have, and their differences. Raises DataError "plate-scale-mismatch"."""
     figures, both = lookup.compare(one, other), (one, other)
     profiles = [lookup.profile(tables) for tables in both]
