@@ -62,28 +62,28 @@ class _Parts:
     planes: Mapping[str, Any]
 
 
-def is_map(image: Any) -> bool:
+def is_map(image: object) -> bool:
     """Whether an object is a sunpy Map."""
     return _is_of(image, "sunpy.map", "GenericMap")
 
 
-def is_nddata(image: Any) -> bool:
+def is_nddata(image: object) -> bool:
     """Whether an object is an NDData, such as a CCDData. A sunpy Map is also an NDData."""
     return _is_of(image, "astropy.nddata", "NDData")
 
 
-def is_hdu(image: Any) -> bool:
+def is_hdu(image: object) -> bool:
     """Whether an object is an HDU of images."""
     return isinstance(image, _HDUS)
 
 
-def is_pair(image: Any) -> bool:
+def is_pair(image: object) -> bool:
     """Whether an object is an array with its metadata: (array, header or table of cards)."""
     return isinstance(image, tuple) and len(image) == 2 and isinstance(image[1], Mapping | Header)
 
 
 @contextmanager
-def on_disk(image: Any) -> Iterator[Any]:
+def on_disk(image: object) -> Iterator[object]:
     """The path of a temporary file with the bytes of a FITS file; any other image unchanged."""
     if isinstance(image, bytes | bytearray | memoryview):
         with TemporaryDirectory() as folder:
@@ -94,23 +94,23 @@ def on_disk(image: Any) -> Iterator[Any]:
         yield image
 
 
-def is_sequence(image: Any) -> bool:
+def is_sequence(image: object) -> bool:
     """Whether an object is a MapSequence of sunpy."""
     return _is_of(image, "sunpy.map", "MapSequence")
 
 
-def is_many(image: Any) -> bool:
+def is_many(image: object) -> bool:
     """Whether an object is a list of images: a list, a tuple, what ``Fido.fetch`` returns, or a MapSequence."""
     one = isinstance(image, str | bytes | bytearray | memoryview | fits.HDUList) or is_pair(image)
     return (isinstance(image, Sequence) and not one) or is_sequence(image)
 
 
-def _is_of(image: Any, module: str, name: str) -> bool:
+def _is_of(image: object, module: str, name: str) -> bool:
     # While a module is imported, it has no classes yet.
     return isinstance(image, getattr(sys.modules.get(module), name, ()))
 
 
-def image_of(image: Any, *, saturation: Any, hdu: int | None = None) -> Image:
+def image_of(image: object, *, saturation: object, hdu: int | None = None) -> Image:
     """The ``Image`` of psfcore for an image of the user. saturation: a number of DN, or a quantity.
 
     Pixels that the mask excludes are pixels without a value. Raises ``DataError`` "bad-input" for another
@@ -137,7 +137,7 @@ def image_of(image: Any, *, saturation: Any, hdu: int | None = None) -> Image:
     )
 
 
-def _as_large(plane: Any, shape: tuple[int, ...]) -> NDArray[Any]:
+def _as_large(plane: Any, shape: tuple[int, ...]) -> NDArray[np.generic]:
     """A mask or an uncertainty for every pixel. Raises ``DataError`` "mask-shape"."""
     try:
         return np.broadcast_to(plane, shape)
@@ -173,7 +173,7 @@ def uncertainty_of(image: Any) -> NDArray[np.float64] | None:
         return None
 
 
-def shape_of(image: Any, hdu: int | None = None) -> tuple[int, int]:
+def shape_of(image: object, hdu: int | None = None) -> tuple[int, int]:
     """The shape (ny, nx) of an image of the user. No pixel of a file is read.
 
     Raises ``DataError`` "bad-input", "no-such-file" or "not-2d", and the errors of reading a header.
@@ -189,7 +189,7 @@ def shape_of(image: Any, hdu: int | None = None) -> tuple[int, int]:
     return shape[0], shape[1]
 
 
-def header_of(image: Any, hdu: int | None = None) -> Header:
+def header_of(image: object, hdu: int | None = None) -> Header:
     """The header of an image of the user, or of its header alone (a ``Header`` or a table of cards).
 
     Raises ``DataError`` "bad-input", "bad-unit", "no-such-file", and the errors of reading a header.
@@ -205,7 +205,7 @@ def header_of(image: Any, hdu: int | None = None) -> Header:
     return _header(image) if isinstance(image, Mapping) else _parts_of(image).header
 
 
-def hdu_of(image: Any, number: int | None = None) -> Any:
+def hdu_of(image: object, number: int | None = None) -> Any:
     """An HDU, or that of an HDUList as `_chosen` chooses it."""
     chosen, hdus = _chosen(image, number)
     return hdus[chosen]
@@ -260,7 +260,7 @@ def _parts_of(image: Any) -> _Parts:
     return parts
 
 
-def _computed(data: Any) -> NDArray[Any]:
+def _computed(data: Any) -> NDArray[np.generic]:
     """The pixels. A dask array is computed, with a ``DataWarning`` "dask-computed"."""
     if not hasattr(data, "compute"):
         return np.asarray(data)

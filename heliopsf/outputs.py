@@ -7,7 +7,7 @@ import hashlib
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from astropy import units
@@ -138,8 +138,7 @@ class Deconvolution(Shown, Product):
         MissingExtra
             The extra "plot" is not installed.
         """
-        drawn: Axes = module_of_extra("heliopsf.plots").draw_image(self, axes)
-        return drawn
+        return cast("Axes", module_of_extra("heliopsf.plots").draw_image(self, axes))
 
     def plot_change(self, axes: Axes | None = None) -> Axes:
         """Draw the change of each pixel in percent of the input.
@@ -159,8 +158,7 @@ class Deconvolution(Shown, Product):
         MissingExtra
             The extra "plot" is not installed.
         """
-        drawn: Axes = module_of_extra("heliopsf.plots").draw_change(self, axes)
-        return drawn
+        return cast("Axes", module_of_extra("heliopsf.plots").draw_change(self, axes))
 
     def quicklook(self) -> Figure:
         """Draw the image before and after, and the change.
@@ -175,8 +173,7 @@ class Deconvolution(Shown, Product):
         MissingExtra
             The extra "plot" is not installed.
         """
-        figure: Figure = module_of_extra("heliopsf.plots").before_and_after(self)
-        return figure
+        return cast("Figure", module_of_extra("heliopsf.plots").before_and_after(self))
 
 
 def in_form_of(image: Any, result: Deconvolution) -> Any:
@@ -247,7 +244,7 @@ def _uncertainty(result: Deconvolution) -> Any:
     return StdDevUncertainty(result.error)
 
 
-def _stored(plane: NDArray[Any]) -> NDArray[Any]:
+def _stored(plane: NDArray[np.generic]) -> NDArray[np.generic]:
     return plane.astype(np.float32) if plane.dtype.kind == "f" else plane
 
 

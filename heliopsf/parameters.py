@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
@@ -13,6 +13,7 @@ from astropy import units
 from psfcore.deconvolve.box import LARGEST_ERROR
 from psfcore.deconvolve.declaration import Edges
 from psfcore.errors import DataError
+from psfcore.fits.cards import Cards
 from psfcore.fits.header import optional_exposure_s
 from psfcore.noise import Noise
 
@@ -88,7 +89,7 @@ class Options:
 COUNTS = (units.DN, units.adu, units.ct)
 
 
-def plain(name: str, value: Any, *allowed: Any) -> NDArray[np.float64]:
+def plain(name: str, value: object, *allowed: units.UnitBase) -> NDArray[np.float64]:
     """The values of a parameter in the first of these units that fits. Raises DataError "bad-quantity"."""
     expected = f"{name}: expected a number" + (f" of {allowed[0]}, or a quantity in it" if allowed else "")
     if isinstance(value, units.Quantity):
@@ -102,7 +103,7 @@ def plain(name: str, value: Any, *allowed: Any) -> NDArray[np.float64]:
         raise DataError("bad-quantity", f"{expected}; got {value!r:.80}") from error
 
 
-def number(name: str, value: Any, *allowed: Any) -> float:
+def number(name: str, value: object, *allowed: units.UnitBase) -> float:
     """As `plain`, for one number."""
     values = plain(name, value, *allowed)
     if values.ndim or isinstance(value, str | bool):
@@ -110,7 +111,7 @@ def number(name: str, value: Any, *allowed: Any) -> float:
     return float(values)
 
 
-def whole(name: str, value: Any, code: str, *allowed: Any) -> int:
+def whole(name: str, value: object, code: str, *allowed: units.UnitBase) -> int:
     """A whole number. Raises DataError with this code."""
     count = value.to_value(allowed[0]) if isinstance(value, units.Quantity) and allowed else value
     if not isinstance(count, int | float | np.integer) or isinstance(count, bool) or int(count) != count:
@@ -118,7 +119,7 @@ def whole(name: str, value: Any, code: str, *allowed: Any) -> int:
     return int(count)
 
 
-def noise_of(noise: Any) -> Noise | None:
+def noise_of(noise: object) -> Noise | None:
     """The noise figures of the user. Raises DataError "bad-noise" and "bad-quantity"."""
     if noise is None or isinstance(noise, Noise):
         return noise
@@ -132,7 +133,7 @@ def noise_of(noise: Any) -> Noise | None:
     return Noise(gain, number("read noise", noise[1], *COUNTS))
 
 
-def level_dn(level: Any, header: Mapping[str, Any]) -> float | None:
+def level_dn(level: object, header: Cards) -> float | None:
     """The saturation level in DN of one exposure. A level per second is multiplied by the exposure time in the header.
 
     Raises DataError "bad-quantity", and "no-exposure" for a level per second of an image without an exposure time.

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib import pyplot
 from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm, Normalize
+from matplotlib.colors import Colormap, LogNorm, Normalize
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from heliopsf.outputs import Deconvolution, used_psf
 from psfcore.drawing.plots import (
@@ -106,7 +107,7 @@ def draw_fit(fit: TransitFit, axes: Axes | None) -> Axes:
     return axes
 
 
-def _draw(axes: Axes, plane: Any, colours: Any, norm: Any, label: str) -> None:
+def _draw(axes: Axes, plane: NDArray[np.floating], colours: Colormap, norm: Normalize, label: str) -> None:
     drawn = axes.imshow(plane, origin="lower", cmap=colours, norm=norm, interpolation="nearest")
     axes.set(xlabel="x (px)", ylabel="y (px)")
     _figure(axes).colorbar(drawn, ax=axes, label=label)

@@ -7,7 +7,7 @@ from dataclasses import fields, replace
 from datetime import datetime
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
 from astropy import units
@@ -102,7 +102,7 @@ class Psf(Shown, CorePsf):
         "psf-off-centre".
     """
 
-    def light_beyond(self, radii: ArrayLike | units.Quantity) -> NDArray[Any]:
+    def light_beyond(self, radii: ArrayLike | units.Quantity) -> NDArray[np.generic]:
         """Measure the light beyond radii: 1 - encircled energy.
 
         Parameters
@@ -180,8 +180,7 @@ class Psf(Shown, CorePsf):
         MissingExtra
             The extra "plot" is not installed.
         """
-        drawn: Axes = module_of_extra("heliopsf.plots").draw_psf(self, axes, size=size)
-        return drawn
+        return cast("Axes", module_of_extra("heliopsf.plots").draw_psf(self, axes, size=size))
 
     def plot_curve(self, axes: Axes | None = None) -> Axes:
         """Draw 1 - encircled energy by radius, of the PSF and of its components.
@@ -201,8 +200,7 @@ class Psf(Shown, CorePsf):
         MissingExtra
             The extra "plot" is not installed.
         """
-        drawn: Axes = module_of_extra("heliopsf.plots").draw_curves(self, axes)
-        return drawn
+        return cast("Axes", module_of_extra("heliopsf.plots").draw_curves(self, axes))
 
     def quicklook(self) -> Figure:
         """Draw the centre, the mean weight by radius and the light beyond a radius.
@@ -217,8 +215,7 @@ class Psf(Shown, CorePsf):
         MissingExtra
             The extra "plot" is not installed.
         """
-        figure: Figure = module_of_extra("psfcore.drawing.plots").psf_figure(self)
-        return figure
+        return cast("Figure", module_of_extra("psfcore.drawing.plots").psf_figure(self))
 
     def lines(self) -> list[str]:
         """Describe the PSF in two lines.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from heliopsf.parameters import NoiseFigures, Number, Stages, level_dn, noise_of, stage_reporter
 from heliopsf.psfs import Psf, build_psf
@@ -100,8 +100,7 @@ class ScatterFit(TransitFit):
         MissingExtra
             The extra "plot" is not installed.
         """
-        drawn: Axes = module_of_extra("heliopsf.plots").draw_fit(self, axes)
-        return drawn
+        return cast("Axes", module_of_extra("heliopsf.plots").draw_fit(self, axes))
 
     def quicklook(self) -> Figure:
         """Draw curves, residuals and convergence of the fit.
@@ -116,8 +115,7 @@ class ScatterFit(TransitFit):
         MissingExtra
             The extra "plot" is not installed.
         """
-        figure: Figure = module_of_extra("psfcore.scatter.plots").fit_figure(self)
-        return figure
+        return cast("Figure", module_of_extra("psfcore.scatter.plots").fit_figure(self))
 
 
 class GapDiagnosis(diagnose.Diagnosis):
@@ -217,8 +215,7 @@ class GapDiagnosis(diagnose.Diagnosis):
         MissingExtra
             The extra "plot" is not installed.
         """
-        figure: Figure = module_of_extra("psfcore.gap.report.plot").gap_figure(self, self.report())
-        return figure
+        return cast("Figure", module_of_extra("psfcore.gap.report.plot").gap_figure(self, self.report()))
 
 
 def fit_scatter(

@@ -74,7 +74,7 @@ class Comparison:
     sha256: tuple[str, str]
 
 
-def compare(first: NDArray[Any], again: NDArray[Any]) -> Comparison:
+def compare(first: NDArray[np.generic], again: NDArray[np.generic]) -> Comparison:
     """Compare two arrays of numbers; NaN equals NaN."""
     hashes = (array_sha256(first), array_sha256(again))
     kinds = {array.dtype.newbyteorder("<") for array in (first, again)}
@@ -93,7 +93,7 @@ def compare(first: NDArray[Any], again: NDArray[Any]) -> Comparison:
     return Comparison(same, relative, count, hashes)
 
 
-def array_sha256(array: NDArray[Any]) -> str:
+def array_sha256(array: NDArray[np.generic]) -> str:
     """SHA-256 (hex) of an array's values in C order and little-endian, in the array's number type.
 
     The hash does not depend on the byte order and the memory layout of the array.

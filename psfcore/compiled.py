@@ -40,7 +40,8 @@ from numba.core.caching import (
 )
 from numba.core.ccallback import CFunc
 from numba.core.dispatcher import Dispatcher
-from numba.core.runtime import rtsys
+from numba.core.runtime.nrt import rtsys
+from numba.core.typing.templates import Signature
 
 from psfcore.files import CACHE_VARIABLE, cache_folder
 
@@ -70,9 +71,9 @@ def compiled(
         function.__qualname__ = name or function.__qualname__
         # Without the wrapper for callers in C: nothing calls it, and it takes time to compile.
         options.update(nogil=True, no_cfunc_wrapper=True)
-        kernel: Any = njit(**options)(function)
+        kernel: Callable[..., Any] = njit(**options)(function)
         if isinstance(kernel, Dispatcher):  # it is a plain function if compilation is switched off
-            kernel._cache = KernelCache(function)  # type: ignore[attr-defined]
+            kernel._cache = KernelCache(function)  # type: ignore[attr-defined]  # numba has no public way
         return kernel
 
     return decorate
@@ -81,7 +82,9 @@ def compiled(
 class Addressed:
     """A kernel that other kernels call by its address. Such kernels need not be compiled again if this one changes."""
 
-    def __init__(self, function: Callable[..., None], signature: Any, options: dict[str, Any]) -> None:
+    def __init__(
+        self, function: Callable[..., None], signature: Signature, options: dict[str, object]
+    ) -> None:
         self._function = function
         self._kernel = CFunc(function, (signature.args, signature.return_type), {}, options)
         self.__qualname__ = function.__qualname__
@@ -97,7 +100,7 @@ class Addressed:
 
 
 def compiled_at_address(
-    signature: Any, *, name: str, **options: Any
+    signature: Signature, *, name: str, **options: object
 ) -> Callable[[Callable[..., None]], Addressed]:
     """Decorator for a kernel that is called by its address: `numba.cfunc` with this signature and these options.
 
@@ -125,7 +128,7 @@ class _Private(UserWideCacheLocator):
 class _Place(CompileResultCacheImpl):
     """The folder that numba chooses for the machine code of a function; the private one if it can write to none."""
 
-    def __init__(self, function: Callable[..., Any]) -> None:
+    def __init__(self, function: Callable[..., object]) -> None:
         try:
             super().__init__(function)
         except RuntimeError:  # numba found no folder, and would not even compile the function
@@ -139,7 +142,7 @@ class KernelCache(FunctionCache):
 
     _impl_class = _Place
 
-    def __init__(self, function: Callable[..., Any]) -> None:
+    def __init__(self, function: Callable[..., object]) -> None:
         super().__init__(function)
         self._cache_file = KernelFiles(
             kernel_folder(Path(self.cache_path)),
@@ -147,7 +150,7 @@ class KernelCache(FunctionCache):
             self._impl.locator.get_source_stamp(),
         )
 
-    def load_overload(self, signature: Any, target_context: Any) -> Any:
+    def load_overload(self, signature: object, target_context: object) -> object:
         """The machine code for these types of arguments; None if it is not on disk.
 
         numba's own method first makes all types and functions known to the compiler, which takes longer than to load all
@@ -240,9 +243,9 @@ def trusted(path: Path) -> bool:
     return True
 
 
-def is_kept(kernel: Any) -> bool:
+def is_kept(kernel: object) -> bool:
     """Whether the disk has machine code of a kernel, compiled from the current sources, for any types of its arguments."""
-    return not isinstance(kernel, Dispatcher) or kernel._cache._cache_file.any_kept()  # type: ignore[attr-defined]
+    return not isinstance(kernel, Dispatcher) or kernel._cache._cache_file.any_kept()  # type: ignore[attr-defined]  # as above
 
 
 class KernelFiles(IndexDataCacheFile):
@@ -251,7 +254,7 @@ class KernelFiles(IndexDataCacheFile):
     The key consists of the argument types, the processor and the constants of a closure.
     """
 
-    def save(self, key: Any, data: Any) -> None:
+    def save(self, key: object, data: object) -> None:
         """Write a kernel to disk in one step. If this fails, log a warning once; the kernel can still be used."""
         _tell(done=True)
         if not trusted(Path(self._cache_path)):
@@ -264,7 +267,7 @@ class KernelFiles(IndexDataCacheFile):
         except OSError as error:
             _tell_not_kept(self._cache_path, error.strerror)
 
-    def load(self, key: Any) -> Any:
+    def load(self, key: object) -> object:
         """The kernel for this key, compiled from the current sources; None if it is not on disk and must be
         compiled."""
         data = self._found(self._name(key))
@@ -277,7 +280,7 @@ class KernelFiles(IndexDataCacheFile):
         pattern = self._index_name.removesuffix("nbi") + "*.nbc"
         return any(self._is_good(path.name) for path in Path(self._cache_path).glob(pattern))
 
-    def _found(self, name: str) -> Any:
+    def _found(self, name: str) -> object:
         if not (
             self._is_good(name) and trusted(Path(self._cache_path)) and trusted(Path(self._data_path(name)))
         ):
@@ -297,7 +300,7 @@ class KernelFiles(IndexDataCacheFile):
         stamp = repr((self._version, self._source_stamp, sources_sha256()))
         return hashlib.sha256(stamp.encode()).digest() + hashlib.sha256(payload).digest()
 
-    def _name(self, key: Any) -> str:
+    def _name(self, key: object) -> str:
         text = repr((self._version, key))
         return self._index_name.removesuffix("nbi") + hashlib.sha256(text.encode()).hexdigest()[:24] + ".nbc"
 

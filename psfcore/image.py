@@ -79,9 +79,9 @@ class Image:
     def finite(self) -> NDArray[np.bool_]:
         """True for pixels that hold a number, [y, x]; some of them may be saturated."""
         # The value is a plain int: numpy would turn the mask into int64 for a member of the class.
-        return (self.mask & MaskBit.NONFINITE.value) == 0
+        return np.asarray((self.mask & MaskBit.NONFINITE.value) == 0)
 
     @property
     def valid(self) -> NDArray[np.bool_]:
         """True for pixels that can be trusted, [y, x]."""
-        return self.mask == 0
+        return np.asarray(self.mask == 0)

@@ -217,7 +217,7 @@ def _download(
     progress: Callable[[str, int, int], None],
     url: str,
     output_file: str,
-    _: Any,
+    _: object,
 ) -> None:
     """A downloader for pooch. It keeps in ``folder`` what arrived, and asks for the rest alone.
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +16,7 @@ REACH_GRID_PX = 2048  # light is counted over this grid: the full reach
 BUILD_VERSION = 3  # raise this number when a change of the code changes the PSF of a recipe
 
 
-def canonical_hash(content: dict[str, Any]) -> str:
+def canonical_hash(content: Mapping[str, object]) -> str:
     """SHA-256 of a JSON object in canonical form (sorted keys, no spaces)."""
     text = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()

@@ -160,7 +160,7 @@ def _correct_description(app: FastAPI) -> None:
         assert app.openapi_schema is not None
         return app.openapi_schema
 
-    app.openapi = openapi  # type: ignore[method-assign]
+    app.openapi = openapi  # type: ignore[method-assign]  # FastAPI's way to extend its description
 
 
 def _correct(description: dict[str, Any]) -> None:

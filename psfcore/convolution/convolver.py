@@ -178,7 +178,7 @@ class ChirpTransform:
 
 
 def _chirp(ratio: float, n: NDArray[np.floating]) -> NDArray[np.complex128]:
-    return np.exp(1j * np.pi * ratio * n**2)
+    return np.asarray(np.exp(1j * np.pi * ratio * n**2))
 
 
 def transform_axis(a: NDArray[np.complex64], *, axis: int, threads: int = 1) -> NDArray[np.complex64]:

@@ -26,14 +26,14 @@ import queue
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.compiled import compiled
-from psfcore.convolution.fft_kernels import LANES, Plan, forward, inverse, make_plan
-from psfcore.convolution.lanes import join, scale, split, transpose, turn, turn_back
+from psfcore.convolution.fft_kernels import Plan, forward, inverse, make_plan
+from psfcore.convolution.lanes import LANES, join, scale, split, transpose, turn, turn_back
 from psfcore.convolution.lengths import good_length
 from psfcore.convolution.offsets import needed_kernel
 from psfcore.errors import DataError
@@ -50,6 +50,7 @@ _CHUNKS_A_THREAD = (2, 4)
 _BLOCKS_A_CHUNK = 8
 
 Single = NDArray[np.float32]
+Result = TypeVar("Result")
 
 
 class Scratch(NamedTuple):
@@ -136,7 +137,7 @@ class Engine:
     @property
     def symmetric(self) -> bool:
         """Whether the PSF is symmetric about its centre. The transfer function is then real."""
-        return self.transfer.shape[2] == 1
+        return bool(self.transfer.shape[2] == 1)
 
     # Whole operators -------------------------------------------------------------------------------
 
@@ -212,27 +213,27 @@ class Engine:
         """
         self._stage(_columns, self.column_plan, self.column_blocks, transfer, conjugate)
 
-    def row_stage(self, kernel: Callable[..., None], *fields: Any) -> None:
+    def row_stage(self, kernel: Callable[..., None], *fields: object) -> None:
         """Run the compiled row function of a method on all blocks: `kernel(lines, start, stop, *fields)`.
 
         lines: the rows, with the working memory of the thread. start, stop: the range of blocks.
         """
         self._stage(kernel, self.row_plan, self.row_blocks, *fields)
 
-    def _stage(self, kernel: Callable[..., None], plan: Plan, blocks: int, *fields: Any) -> None:
+    def _stage(self, kernel: Callable[..., None], plan: Plan, blocks: int, *fields: object) -> None:
         spectrum = self._spectrum
         self.run(
             lambda start, stop, scratch: kernel(Lines(spectrum, *scratch, plan), start, stop, *fields), blocks
         )
 
-    def run(self, work: Callable[[int, int, Scratch], Any], blocks: int) -> list[Any]:
+    def run(self, work: Callable[[int, int, Scratch], Result], blocks: int) -> list[Result]:
         """Call `work(start, stop, scratch)` on ranges that cover all blocks, using all threads."""
         few, many = _CHUNKS_A_THREAD
         a_thread = min(max(blocks // (_BLOCKS_A_CHUNK * self.threads), few), many)
         chunks = min(blocks, self.threads * a_thread) if self.threads > 1 else 1
         bounds = [blocks * n // chunks for n in range(chunks + 1)]
 
-        def one(n: int) -> Any:
+        def one(n: int) -> Result:
             scratch = self._scratch.get()
             try:
                 return work(bounds[n], bounds[n + 1], scratch)
@@ -242,13 +243,13 @@ class Engine:
         # A single chunk runs in this thread.
         return [one(0)] if chunks == 1 else self._shared_out(one, chunks)
 
-    def _shared_out(self, one: Callable[[int], Any], chunks: int) -> list[Any]:
+    def _shared_out(self, one: Callable[[int], Result], chunks: int) -> list[Result]:
         """Process all chunks and return their results. The calling thread works too; each thread takes the next free chunk.
 
         The chunks are not handed to a thread one by one: for a small image, it takes longer to wake a thread than to
         process a chunk.
         """
-        results: list[Any] = [None] * chunks
+        results: dict[int, Result] = {}
         taken = itertools.count()
 
         def work() -> None:
@@ -261,7 +262,7 @@ class Engine:
         finally:
             for other in others:  # wait, because the other threads write to the same spectrum
                 other.result()
-        return results
+        return [results[n] for n in range(chunks)]
 
     @property
     def transfer_scale(self) -> int:
@@ -333,7 +334,7 @@ def _wrapped_rows(
 
 
 @compiled()
-def rows_to_spectrum(lines, block, nx):  # type: ignore[no-untyped-def]
+def rows_to_spectrum(lines: Lines, block: int, nx: int) -> None:
     """Transform the block of rows that the buffer holds, `nx` px long, and separate it into the spectra of its 32 rows.
 
     Each complex signal of the block contains two real rows. If Z is the transform of a + i b with real a and b, then
@@ -359,7 +360,7 @@ def rows_to_spectrum(lines, block, nx):  # type: ignore[no-untyped-def]
 
 
 @compiled()
-def rows_from_spectrum(lines, block):  # type: ignore[no-untyped-def]
+def rows_from_spectrum(lines: Lines, block: int) -> Single:
     """Transform a block of 32 rows back into the buffer, and return the buffer as [x, half, lane].
 
     The spectra of the rows are joined first: Z[k] = A[k] + i B[k] and Z[L-k] = A*[k] + i B*[k], the inverse of
@@ -385,19 +386,19 @@ def rows_from_spectrum(lines, block):  # type: ignore[no-untyped-def]
 
 
 @compiled()
-def _copy(values, target, count):  # type: ignore[no-untyped-def]
+def _copy(values: Single, target: Single, count: int) -> None:
     for n in range(count):
         target[n] = values[n]
 
 
 @compiled()
-def _clear(buffer, filled, length):  # type: ignore[no-untyped-def]
+def _clear(buffer: Single, filled: int, length: int) -> None:
     """Set the buffer of a transform to 0 beyond its first `filled` numbers."""
     buffer[filled : length * _SIZE] = np.float32(0.0)
 
 
 @compiled()
-def _rows_forward(lines, start, stop, lanes, first_block):  # type: ignore[no-untyped-def]
+def _rows_forward(lines: Lines, start: int, stop: int, lanes: Single, first_block: int) -> None:
     """Transform the rows of blocks. first_block: the block of the spectrum to which block 0 of `lanes` belongs."""
     nx = lanes.shape[1]
     for block in range(start, stop):
@@ -406,14 +407,14 @@ def _rows_forward(lines, start, stop, lanes, first_block):  # type: ignore[no-un
 
 
 @compiled()
-def _rows_inverse(lines, start, stop, lanes):  # type: ignore[no-untyped-def]
+def _rows_inverse(lines: Lines, start: int, stop: int, lanes: Single) -> None:
     for block in range(start, stop):
         rows_from_spectrum(lines, block)
         _copy(lines.buffer, lanes[block].reshape(-1), lanes.shape[1] * _SIZE)
 
 
 @compiled()
-def _columns(lines, start, stop, transfer, conjugate):  # type: ignore[no-untyped-def]
+def _columns(lines: Lines, start: int, stop: int, transfer: Single, conjugate: bool) -> None:
     """Multiply columns by the transfer function, real or complex, or by its conjugate."""
     buffer, length = lines.buffer, lines.plan.length
     # A block may have more rows than the transform; the rows beyond the transform are padding and stay zero.

@@ -23,18 +23,28 @@ The inverse of Eq. (1), times L, is the same transform with real and imaginary p
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from llvmlite import ir
 from numba import types
-from numba.extending import intrinsic
+from numba.core.base import BaseContext
+from numba.core.typing.templates import Signature
 from numpy.typing import NDArray
 
 from psfcore.compiled import Addressed, compiled, compiled_at_address
-from psfcore.convolution.lanes import LANES, Memory, constant, parts
+from psfcore.convolution.lanes import (
+    LANES,
+    Memory,
+    Vector,
+    Written,
+    constant,
+    instruction,
+    instruction_of_constants,
+    parts,
+)
 
 _HALF = np.float32(0.5)
 _HALF_ROOT = np.float32(np.sqrt(0.5))
@@ -115,7 +125,7 @@ def _radices(length: int) -> list[int]:
 
 # Butterflies; each leg and each factor is a pair of real and imaginary part ---------------------------------------
 
-Leg = tuple[Any, Any]
+Leg = tuple[Vector, Vector]
 
 
 def _times(a: Leg, w: Leg, first: int = 0) -> Leg:
@@ -160,8 +170,17 @@ _ROUNDED_LAST = {4: (1, 3), 8: (2, 6)}
 _DFT: dict[int, Callable[..., list[Leg]]] = {2: _dft2, 3: _dft3, 4: _dft4, 8: _dft8}
 
 
-@intrinsic(prefer_literal=True)
-def _butterfly(_typing, x, first, step, table, at, radix, backward):  # type: ignore[no-untyped-def]
+@instruction_of_constants
+def _butterfly(
+    _: object,
+    x: types.Type,
+    first: types.Type,
+    step: types.Type,
+    table: types.Type,
+    at: types.Type,
+    radix: types.IntegerLiteral,
+    backward: types.IntegerLiteral,
+) -> Written:
     """One butterfly on all lanes: the legs are the elements first + q step of the buffer x.
 
     The factors of the legs 1, 2, ... begin at table[at]. radix and backward are constants; backward = 1: the inverse, which
@@ -170,7 +189,9 @@ def _butterfly(_typing, x, first, step, table, at, radix, backward):  # type: ig
     legs, inverse = range(radix.literal_value), bool(backward.literal_value)
     real, imaginary = (LANES, 0) if inverse else (0, LANES)
 
-    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def generate(
+        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
+    ) -> ir.Value:
         buffer, first, step, table, at = arguments[:5]
         memory, table = Memory(builder, buffer), Memory(builder, table)
         size = constant(2 * LANES)
@@ -199,7 +220,7 @@ def _make_pass(radix: int, backward: int) -> Addressed:
     factors = 2 * (radix - 1)
 
     @compiled_at_address(_PASS, name=f"{'backward' if backward else 'forward'}_{radix}")
-    def run(buffer, table, length, n):  # type: ignore[no-untyped-def]
+    def run(buffer: Flat, table: Flat, length: int, n: int) -> None:
         m = n // radix
         for base in range(0, length, n):
             for p in range(m):
@@ -212,11 +233,15 @@ _FORWARD = {radix: _make_pass(radix, 0) for radix in _DFT}
 _INVERSE = {radix: _make_pass(radix, 1) for radix in _DFT}
 
 
-@intrinsic
-def _call(_typing, address, x, twiddles, length, n):  # type: ignore[no-untyped-def]
+@instruction
+def _call(
+    _: object, address: types.Type, x: types.Type, twiddles: types.Type, length: types.Type, n: types.Type
+) -> Written:
     """Call the pass at an address."""
 
-    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def generate(
+        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
+    ) -> ir.Value:
         at, *arrays, length, n = arguments
         kinds = signature.args[1:3]
         pointers = [
@@ -232,7 +257,7 @@ def _call(_typing, address, x, twiddles, length, n):  # type: ignore[no-untyped-
 
 
 @compiled()
-def forward(x, plan):  # type: ignore[no-untyped-def]
+def forward(x: Flat, plan: Plan) -> None:
     """Compute Eq. (1) for sixteen lanes, in place. The frequency k is at index `plan.place[k]` of the result."""
     for stage in range(plan.lengths.size):
         _call(
@@ -241,7 +266,7 @@ def forward(x, plan):  # type: ignore[no-untyped-def]
 
 
 @compiled()
-def inverse(x, plan):  # type: ignore[no-untyped-def]
+def inverse(x: Flat, plan: Plan) -> None:
     """Compute `length` times the inverse of `forward`, in place. The result is in natural order."""
     for stage in range(plan.lengths.size - 1, -1, -1):
         _call(

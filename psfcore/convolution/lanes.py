@@ -12,17 +12,28 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cache, partial
-from typing import Any
 
 import numpy as np
 from llvmlite import ir
 from llvmlite.binding import get_host_cpu_features
 from numba import types
+from numba.core.base import BaseContext
 from numba.core.cgutils import get_or_insert_function
 from numba.core.errors import TypingError
+from numba.core.typing.templates import Signature
 from numba.extending import intrinsic
 
 LANES = 16
+
+# What an intrinsic of numba returns: the types of its arguments, and the function that writes its instructions.
+Written = tuple[Signature, Callable[..., ir.Value]]
+# numba gives the decorated function the context of the compiler and the types of the arguments. Kernels call it with the
+# arguments alone.
+instruction: Callable[[Callable[..., Written]], Callable[..., object]] = intrinsic
+# The types of constant arguments hold their values.
+instruction_of_constants: Callable[[Callable[..., Written]], Callable[..., object]] = intrinsic(
+    prefer_literal=True
+)
 
 
 class Vector:
@@ -113,13 +124,15 @@ def parts() -> range:
     return range(0, LANES, width())
 
 
-def written(write: Callable[..., None], arrays: Sequence[Any], numbers: int) -> tuple[Any, Any]:
+def written(write: Callable[..., None], arrays: Sequence[types.Type], numbers: int) -> Written:
     """What an intrinsic of numba returns. write(*memories, *indices) writes the instructions for these types of arrays."""
     for kind in arrays:
         if not (isinstance(kind, types.Array) and kind.layout == "C" and kind.dtype == types.float32):
             raise TypingError(f"expected a contiguous array of float32; got {kind}: copy it")
 
-    def generate(context: Any, builder: ir.IRBuilder, _signature: Any, given: Sequence[ir.Value]) -> Any:
+    def generate(
+        context: BaseContext, builder: ir.IRBuilder, _signature: Signature, given: Sequence[ir.Value]
+    ) -> ir.Value:
         pairs = zip(arrays, given[: len(arrays)], strict=True)
         data = (context.make_array(kind)(context, builder, array).data for kind, array in pairs)
         write(*(Memory(builder, one) for one in data), *given[len(arrays) :])
@@ -128,38 +141,50 @@ def written(write: Callable[..., None], arrays: Sequence[Any], numbers: int) -> 
     return types.void(*arrays, *[types.int64] * numbers), generate
 
 
-@intrinsic
-def transpose(_typing, source, target, first, step, to, to_step):  # type: ignore[no-untyped-def]
+@instruction
+def transpose(
+    _: object,
+    source: types.Type,
+    target: types.Type,
+    first: types.Type,
+    step: types.Type,
+    to: types.Type,
+    to_step: types.Type,
+) -> Written:
     """target[to + j to_step + i] = source[first + i step + j] for all lanes i and j."""
     return written(_write_transpose, (source, target), 4)
 
 
-@intrinsic
-def split(_typing, z, corner, p, q, at):  # type: ignore[no-untyped-def]
+@instruction
+def split(
+    _: object, z: types.Type, corner: types.Type, p: types.Type, q: types.Type, at: types.Type
+) -> Written:
     """Separate the complex numbers P at z[p] and Q at z[q]: (P + Q*) / 2 and (P - Q*) / (2 i) go to corner[at]."""
     return written(_write_split, (z, corner), 3)
 
 
-@intrinsic
-def join(_typing, corner, z, at, p, q):  # type: ignore[no-untyped-def]
+@instruction
+def join(
+    _: object, corner: types.Type, z: types.Type, at: types.Type, p: types.Type, q: types.Type
+) -> Written:
     """Join the numbers A and B at corner[at], the inverse of `split`: A + i B goes to z[p], and A* + i B* to z[q]."""
     return written(_write_join, (corner, z), 3)
 
 
-@intrinsic
-def scale(_typing, z, factors, at, of):  # type: ignore[no-untyped-def]
+@instruction
+def scale(_: object, z: types.Type, factors: types.Type, at: types.Type, of: types.Type) -> Written:
     """Multiply the complex numbers at z[at] by the real factors at factors[of]."""
     return written(_write_scale, (z, factors), 2)
 
 
-@intrinsic
-def turn(_typing, z, factors, at, of):  # type: ignore[no-untyped-def]
+@instruction
+def turn(_: object, z: types.Type, factors: types.Type, at: types.Type, of: types.Type) -> Written:
     """Multiply the complex numbers at z[at] by the complex factors at factors[of]."""
     return written(partial(_write_turn, conjugate=False), (z, factors), 2)
 
 
-@intrinsic
-def turn_back(_typing, z, factors, at, of):  # type: ignore[no-untyped-def]
+@instruction
+def turn_back(_: object, z: types.Type, factors: types.Type, at: types.Type, of: types.Type) -> Written:
     """As `turn`, by the conjugates of the factors."""
     return written(partial(_write_turn, conjugate=True), (z, factors), 2)
 

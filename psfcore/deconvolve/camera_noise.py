@@ -57,7 +57,7 @@ _LOWEST = 0.75
 # Mean of this share of the absolute values of a normal distribution with variance 1.
 _LOWEST_MEAN = math.sqrt(2 / math.pi) * -math.expm1(-(ndtri((1 + _LOWEST) / 2) ** 2) / 2) / _LOWEST
 
-Plane = NDArray[np.floating[Any]]
+Plane = NDArray[np.floating]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,9 +119,9 @@ def measured_noise(image: Image, sigma: Plane | None = None) -> CameraNoise:
     blocks = np.arange(len(image.pixels)) // _BLOCK_ROWS
     rows = blocks % -(-image.pixels.size // _MOST_PIXELS) == 0
     # A second difference needs all nine pixels.
-    counted = binary_erosion(image.valid[rows], np.ones((3, 3)), border_value=True)
+    counted = binary_erosion(image.valid[rows], np.ones((3, 3), dtype=np.bool_), border_value=True)
     planes = [filled(image.pixels[rows]), counted, None if sigma is None else sigma[rows]]
-    ny, nx = (side // 2 for side in planes[0].shape)
+    ny, nx = (side // 2 for side in counted.shape)
     quarters = (np.s_[:ny, :nx], np.s_[:ny, nx:], np.s_[ny:, :nx], np.s_[ny:, nx:])
     whole, *parts = (
         _transfer(*(None if plane is None else plane[box] for plane in planes))

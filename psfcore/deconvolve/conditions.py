@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from psfcore.convolution.engine import Engine
 from psfcore.deconvolve.box import Box
-from psfcore.deconvolve.edges import Edges
+from psfcore.deconvolve.declaration import Edges
 from psfcore.errors import DataError
 from psfcore.fits.cards import Cards
 from psfcore.image import Image

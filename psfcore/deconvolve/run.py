@@ -26,9 +26,10 @@ from psfcore.deconvolve.memory import EXPECTED_RIM_PX, Demand, check_memory, pro
 from psfcore.deconvolve.problem import no_noise_model
 from psfcore.deconvolve.summary import assumptions
 from psfcore.deconvolve.work import Assessed, BoxWork, Options, Work, box_work
+from psfcore.fits.cards import optional_text
 from psfcore.fits.channel import check_channel
 from psfcore.fits.frame import frame_of
-from psfcore.fits.header import known_instrument, optional_text
+from psfcore.fits.header import known_instrument
 from psfcore.fits.images import described, write_image
 from psfcore.fits.observation import check_exposure_of_sun
 from psfcore.fits.units import unit_label
@@ -97,9 +98,9 @@ class Product(Deconvolved):
         return None if self.errors is None else self.errors.amplification
 
     @property
-    def planes(self) -> dict[str, NDArray[Any]]:
+    def planes(self) -> dict[str, NDArray[np.generic]]:
         """The planes of the product file by their names."""
-        planes: dict[str, NDArray[Any]] = {"QUALITY": self.assessed.quality}
+        planes: dict[str, NDArray[np.generic]] = {"QUALITY": self.assessed.quality}
         if self.errors is not None:
             planes["ERROR"] = self.errors.error
             if self.errors.psf_error is not None:

@@ -49,7 +49,8 @@ from numpy.typing import NDArray
 from psfcore.deconvolve.assess.changes import Changes, QualityBit, measure_changes, quality_plane
 from psfcore.deconvolve.box import LARGEST_ERROR, Box, region_without_discrepancy, region_without_errors
 from psfcore.deconvolve.conditions import Conditions, Deconvolved, OfBox, Progress, fluxes
-from psfcore.deconvolve.edges import Edges, margin_for, share_from_beyond
+from psfcore.deconvolve.declaration import Edges
+from psfcore.deconvolve.edges import margin_for, share_from_beyond
 from psfcore.deconvolve.methods.registry import method_named, properties_of
 from psfcore.errors import DataError
 from psfcore.fits.viewing.regions import moved_header
@@ -418,7 +419,7 @@ def _means(image: Image, factor: int) -> Plane:
     return np.where(count > 0, total / np.maximum(count, 1), total.sum() / count.sum())
 
 
-def _sums(plane: NDArray[Any], factor: int) -> Plane:
+def _sums(plane: NDArray[np.generic], factor: int) -> Plane:
     ny, nx = (-(-size // factor) for size in plane.shape)
     padded = np.zeros((ny * factor, nx * factor))
     padded[: plane.shape[0], : plane.shape[1]] = plane

@@ -47,7 +47,7 @@ class Page:
     figures: list[bytes]
 
 
-def render(template: str | Template, **values: Any) -> Page:
+def render(template: str | Template, **values: object) -> Page:
     """The page that a template draws from these values. Figures, tables and sections are numbered in reading order.
 
     Raises DataError "not-a-png" for a figure that is no PNG, and "uneven-table" for a row of another length than the
@@ -70,7 +70,7 @@ def render(template: str | Template, **values: Any) -> Page:
     return Page(_FIGURE.sub(inside, html), texts, figures)
 
 
-def named_texts(values: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str]]:
+def named_texts(values: Mapping[str, object], before: str = "") -> Iterator[tuple[str, str]]:
     """Nested values as names and texts. A nested name is preceded by the names of the levels above."""
     for key, value in values.items():
         name = f"{before}{key}".replace("_", " ")

@@ -13,8 +13,10 @@ from typing import IO, Any, NamedTuple
 
 import numpy as np
 from matplotlib.artist import Artist
+from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, LinearSegmentedColormap, LogNorm, Normalize, PowerNorm
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -97,7 +99,7 @@ def _plain_texts(artist: Artist) -> Iterator[Text]:
         yield from _plain_texts(child)
 
 
-def tidy(charts: Sequence[Any]) -> None:
+def tidy(charts: Sequence[Axes]) -> None:
     """Draw a light grid behind the data, and remove the top and right spines."""
     for axes in charts:
         axes.set_axisbelow(True)
@@ -228,7 +230,7 @@ def _smoothed_profile(kernel: Plane) -> tuple[NDArray[np.float64], NDArray[np.fl
     return radius[shown] / count[shown], light[shown] / count[shown]
 
 
-def _draw_centre(figure: Figure, axes: Any, psf: Psf) -> None:
+def _draw_centre(figure: Figure, axes: Axes, psf: Psf) -> None:
     size = min(129, *psf.kernel.shape)
     centre = crop_centred(psf.kernel, (size, size))
     half = size // 2
@@ -266,7 +268,7 @@ def change_pct(before: Plane, after: Plane) -> NDArray[np.float64]:
     return np.asarray(100 * (ratio - 1))
 
 
-def colourbar(figure: Figure, axes: Any, drawn: Any, *, beyond: str) -> None:
+def colourbar(figure: Figure, axes: Axes, drawn: ScalarMappable, *, beyond: str) -> None:
     box = axes.get_position()
     width = 0.0085
     bar_axes = figure.add_axes((box.x1 + 0.006, box.y0, width, box.height))
@@ -313,7 +315,7 @@ def by_pointing(pointings: Sequence[int]) -> list[tuple[int, NDArray[np.bool_], 
 
 
 def draw_errors(
-    axes: Any, pointings: Sequence[int], where: Vector, values: Vector, noise: Vector | None
+    axes: Axes, pointings: Sequence[int], where: Vector, values: Vector, noise: Vector | None
 ) -> None:
     """Draw the errors of images, with their noise if it is known. Values of nan are not drawn.
 
@@ -332,7 +334,7 @@ def draw_errors(
 
 
 def draw_band(
-    axes: Any, x: Vector, limits: NDArray[np.float64], colour: str, name: str, *, marker: str = ""
+    axes: Axes, x: Vector, limits: NDArray[np.float64], colour: str, name: str, *, marker: str = ""
 ) -> None:
     """Draw a median and its bands of 1 and 2 sigma. limits: the rows -2 sigma, -1 sigma, median, +1 sigma, +2 sigma."""
     low_2, low_1, median, high_1, high_2 = limits
@@ -342,7 +344,7 @@ def draw_band(
 
 
 def draw_weights_of_shells(
-    axes: Any, edges_px: Vector, limits: NDArray[np.float64], field_px: float, colour: str
+    axes: Axes, edges_px: Vector, limits: NDArray[np.float64], field_px: float, colour: str
 ) -> None:
     """Draw the weights of the free shells that begin within the field as steps: medians, bands of 1 and 2 sigma.
 
@@ -359,13 +361,13 @@ def draw_weights_of_shells(
     axes.stairs(median, edges, baseline=None, color=colour, linewidth=1.1, label="free shells, median")
 
 
-def draw_totals(axes: Any, totals: Vector, colour: str) -> None:
+def draw_totals(axes: Axes, totals: Vector, colour: str) -> None:
     """Draw a histogram of the total scatter of all fits. totals: fractions of all light."""
     axes.hist(100 * totals, bins=min(25, max(5, totals.size // 4)), color=colour, label="folds")
     axes.set(xlabel="Diffusely scattered light (% of all light)", ylabel="Number of fits")
 
 
-def along_distance(axes: Any, field_px: float, label: str = "Distance (px)") -> None:
+def along_distance(axes: Axes, field_px: float, label: str = "Distance (px)") -> None:
     """Make the x axis a logarithmic axis of distances, with ticks such as 1, 10, 100.
 
     Distances beyond the field are shaded, because the PSF there is an extrapolation of the fitted shape.

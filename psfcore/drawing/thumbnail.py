@@ -19,7 +19,6 @@ from __future__ import annotations
 import struct
 import zlib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,7 +114,7 @@ def reduced(pixels: Plane) -> NDArray[np.float64]:
 def block_means(pixels: Plane, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.float64]:
     """Means of the finite pixels of the blocks that begin at these rows and columns; NaN for a block without any."""
 
-    def sums(plane: NDArray[Any]) -> NDArray[np.float64]:
+    def sums(plane: NDArray[np.generic]) -> NDArray[np.float64]:
         # The first sum is along the rows, because the pixels of a row lie one after the other in memory.
         narrow = np.add.reduceat(plane, columns, axis=1, dtype=np.float64)
         return np.asarray(np.add.reduceat(narrow, rows, axis=0))
@@ -123,9 +122,9 @@ def block_means(pixels: Plane, rows: NDArray[np.intp], columns: NDArray[np.intp]
     finite = np.isfinite(pixels)
     if finite.all():
         heights, widths = np.diff(rows, append=pixels.shape[0]), np.diff(columns, append=pixels.shape[1])
-        return sums(pixels) / np.outer(heights, widths)
+        return np.asarray(sums(pixels) / np.outer(heights, widths))
     total, count = sums(np.where(finite, pixels, 0)), sums(finite)
-    return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
+    return np.asarray(np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0))
 
 
 def levels_of(pixels: Plane) -> NDArray[np.uint8]:

@@ -129,7 +129,7 @@ def number_of(value: object, *, text: bool = True) -> float | None:
     if value is None or isinstance(value, bool):
         return None
     try:
-        number = float(value)  # type: ignore[arg-type]
+        number = float(value)  # type: ignore[arg-type]  # of anything else, float raises one of these errors
     except (TypeError, ValueError, OverflowError):
         return None
     return number if -LARGEST_NUMBER < number < LARGEST_NUMBER else None

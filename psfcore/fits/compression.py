@@ -114,7 +114,7 @@ def _check_rice(settings: dict[str, object], bitpix: int) -> None:
         )
     most, stored = abs(bitpix) // 8, settings.get("BYTEPIX", 0)
     check_card(
-        stored <= most,  # type: ignore[operator]
+        stored <= most,  # type: ignore[operator]  # a number, by the check above
         f"BYTEPIX of at most {most}, the bytes of a pixel with ZBITPIX = {bitpix}",
         stored,
     )

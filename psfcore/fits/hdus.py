@@ -221,7 +221,7 @@ def decode_tiles(
     return {"type": data.dtype.name, "damaged": damaged}
 
 
-def _tiles(path: str, number: int) -> NDArray[Any]:
+def _tiles(path: str, number: int) -> NDArray[np.generic]:
     # uint=False: otherwise astropy converts unsigned integers (BZERO 32768) before it applies BLANK.
     with fits.open(path, mode="readonly", memmap=False, lazy_load_hdus=True, uint=False) as hdus:
         return np.asarray(hdus[number].data)

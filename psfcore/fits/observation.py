@@ -80,7 +80,7 @@ def observation_of_hdus(
 
 def _with_planes(
     stored: StoredImage,
-    read: Callable[[int], NDArray[Any]],
+    read: Callable[[int], NDArray[np.generic]],
     chosen: int | None,
     saturation_dn: float | None,
 ) -> Image:
@@ -88,7 +88,7 @@ def _with_planes(
 
     read(number): the pixels of one of the others. chosen: the number of the HDU, if the caller named it.
     """
-    planes: dict[str, NDArray[Any]] = {}
+    planes: dict[str, NDArray[np.generic]] = {}
     others: list[str] = []
     is_image = content_of(stored.header) == IMAGE
     for number, name, shape in stored.others:
@@ -113,14 +113,14 @@ def _with_planes(
     return image.warned(warnings) if warnings else image
 
 
-def stored_bits(data: NDArray[Any], header: Header) -> int | None:
+def stored_bits(data: NDArray[np.generic], header: Header) -> int | None:
     """BITPIX of an image in memory as it was stored: of its header, or of its whole numbers; None: not known."""
     stated = optional_number(header, "BITPIX")
     of_data = 8 * data.dtype.itemsize if data.dtype.kind in "iu" else None
     return of_data if stated is None else int(stated)
 
 
-def real_pixels(data: NDArray[Any]) -> NDArray[np.float64]:
+def real_pixels(data: NDArray[np.generic]) -> NDArray[np.float64]:
     """Pixels [y, x] as real numbers. Raises DataError "bad-input" for another type, and "not-2d"."""
     if data.dtype.kind not in "iufb":
         raise DataError("bad-input", f"expected pixels that are real numbers; got the type {data.dtype}")
@@ -154,7 +154,7 @@ def observation_of(
     header: Header,
     *,
     bits: int | None = None,
-    planes: Mapping[str, NDArray[Any]] | None = None,
+    planes: Mapping[str, NDArray[np.generic]] | None = None,
     saturation_dn: float | None = None,
 ) -> Image:
     """The image of pixels [y, x] and a header, with its unusable pixels masked.

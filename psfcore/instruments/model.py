@@ -15,7 +15,15 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, get_args, get_type_hints
 
-from pydantic import BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+from pydantic import (
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    TypeAdapter,
+    ValidationError,
+    model_validator,
+    with_config,
+)
 from pydantic.dataclasses import dataclass
 from pydantic_core import ErrorDetails
 from typing_extensions import TypedDict
@@ -57,10 +65,9 @@ Name = Annotated[str, Field(max_length=80)]
 Share = Annotated[Number, Field(gt=0, lt=1)]
 
 
+@with_config(_CONFIG)
 class Match(TypedDict, total=False):
     """The cards of the images of an instrument."""
-
-    __pydantic_config__ = _CONFIG  # type: ignore[misc]
 
     TELESCOP: Name
     OBSRVTRY: Name

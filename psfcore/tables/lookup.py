@@ -6,18 +6,6 @@
 E is a fraction of all light. C(R) is the light that falls farther than R from the centre, or outside the array.
 On an array larger than the full reach the weights can sum to more than 1 (E > 1); then C is 0.
 
-| field | content |
-|---|---|
-| schema | SCHEMA |
-| name, version, shape, reach_px, plate_scale_arcsec | these fields of the PSF |
-| sum, central_weight | sum of all weights; weight of the central pixel |
-| radii_px | the radii R of the tables, ascending |
-| exact_to_px | up to this radius E is a staircase, and the tables hold every step |
-| interpolation_error | by component: the largest error of an interpolated E, found at test radii |
-| encircled | by component, TOTAL included: E at radii_px |
-| encircled_changes | by component: one row for each axis of the fit's covariance, with the change of E for a step of 1 sigma; {} if not fitted |
-| profile | by ring of one pixel: radius_px, pixels, mean_weight, sigma, azimuthal_rms_over_mean (of TOTAL) |
-
 To compute the 1-sigma error of a number that is linear in E, compute the same number from each row of
 encircled_changes, and take the root of the sum of the squares of these numbers. This method includes correlations. For
 example, the error of the light in an annulus is not the sum of the errors at its two radii.
@@ -31,8 +19,8 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, TypedDict
 
 from psfcore.errors import DataError
 from psfcore.instruments.files import PLATE_SCALE_TOLERANCE
@@ -46,8 +34,37 @@ LARGEST_COUNT = 500  # largest number of radii in one question
 # Smaller interpolation errors (percentage points) are reported only as "below 0.005".
 NEGLIGIBLE_POINTS = 0.005
 
-Tables = Mapping[str, Any]
 Numbers = list[float]
+
+
+class Profile(TypedDict):
+    """Mean weights, by ring of one pixel. sigma: of the total PSF and its scatter; {} if not fitted."""
+
+    radius_px: Numbers
+    pixels: list[int]
+    mean_weight: dict[str, Numbers]
+    sigma: dict[str, Numbers]
+    azimuthal_rms_over_mean: Numbers  # of TOTAL
+
+
+class Tables(TypedDict):
+    """The tables of a PSF, as JSON values. The dictionaries are by component, TOTAL included."""
+
+    schema: str
+    name: str
+    version: str
+    shape: list[int]
+    sum: float  # of all weights
+    central_weight: float
+    reach_px: float
+    plate_scale_arcsec: float | None
+    radii_px: Numbers  # R, ascending
+    exact_to_px: int  # up to this radius E is a staircase, and the tables hold every step
+    interpolation_error: dict[str, float]  # the largest error of an interpolated E, found at test radii
+    encircled: dict[str, Numbers]  # E at radii_px
+    # One row for each axis of the fit's covariance, with the change of E for a step of 1 sigma; {} if not fitted.
+    encircled_changes: dict[str, list[Numbers]]
+    profile: Profile
 
 
 def curve(tables: Tables, radii: Sequence[float] | None = None) -> dict[str, Any]:
@@ -130,11 +147,15 @@ def compare(one: Tables, other: Tables) -> dict[str, Any]:
 
     Raises DataError "plate-scale-mismatch".
     """
-    scales = [tables["plate_scale_arcsec"] for tables in (one, other)]
-    if None not in scales and abs(scales[1] / scales[0] - 1) > PLATE_SCALE_TOLERANCE:
+    old_scale, new_scale = one["plate_scale_arcsec"], other["plate_scale_arcsec"]
+    if (
+        old_scale is not None
+        and new_scale is not None
+        and abs(new_scale / old_scale - 1) > PLATE_SCALE_TOLERANCE
+    ):
         raise DataError(
             "plate-scale-mismatch",
-            f"expected two PSFs of the same plate scale; got {scales[0]:g} and {scales[1]:g} arcsec/px: rebin one of them first",
+            f"expected two PSFs of the same plate scale; got {old_scale:g} and {new_scale:g} arcsec/px: rebin one of them first",
         )
     reach = min(one["reach_px"], other["reach_px"])
     shared = set(other["radii_px"])

@@ -19,8 +19,6 @@ the fit. These changes are computed to first order, as in the report of the fit.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,17 +27,25 @@ from psfcore.deconvolve.assess.error_planes import sigma_points
 from psfcore.psf import Psf, encircled_energy, radial_profile, squared_radii
 from psfcore.scatter.shapes import DIFFERENCE, shape_named
 from psfcore.scatter.total_psf import DIFFRACTION, SCATTER
-from psfcore.tables.lookup import EXACT_TO_PX, SCHEMA, STEP, TOTAL, WHOLE_TO_PX
+from psfcore.tables.lookup import (
+    EXACT_TO_PX,
+    SCHEMA,
+    STEP,
+    TOTAL,
+    WHOLE_TO_PX,
+    Numbers,
+    Profile,
+    Tables,
+)
 
 DIGITS = 10  # significant digits of a number in the tables
 
 Kernel = NDArray[np.float64]
 Vector = NDArray[np.float64]
-Numbers = list[float]
 
 
-def tables_of(psf: Psf, *, threads: int = 1) -> dict[str, Any]:
-    """The tables of a PSF as JSON values, with the fields of `psfcore.tables.lookup`."""
+def tables_of(psf: Psf, *, threads: int = 1) -> Tables:
+    """The tables of a PSF."""
     kernels = {TOTAL: psf.kernel, **psf.components}
     radii = table_radii(psf.reach_px)
     test_radii = _test_radii(radii)
@@ -119,7 +125,7 @@ def _read_off(changes: list[Kernel], radii: Vector) -> tuple[list[Vector], list[
     return within, [radial_profile(change)[1] for change in changes]
 
 
-def _profile(kernels: dict[str, Kernel], sigma: dict[str, Vector]) -> dict[str, Any]:
+def _profile(kernels: dict[str, Kernel], sigma: dict[str, Vector]) -> Profile:
     radius, mean = radial_profile(kernels[TOTAL])
     rings = radius.astype(np.int64)
     ring = np.rint(np.sqrt(squared_radii(kernels[TOTAL].shape))).astype(np.int64).ravel()

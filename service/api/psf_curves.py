@@ -5,9 +5,9 @@ A job makes the tables when it builds or fits a PSF. An uploaded PSF has no tabl
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO
+from typing import Annotated, Any, BinaryIO, cast
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
@@ -180,7 +180,7 @@ async def get_cutout(
     return await cutout_of(request, state, row, part, write, filename=filename)
 
 
-def tables_of(state: State, caller: Caller, psf_id: str) -> Mapping[str, Any]:
+def tables_of(state: State, caller: Caller, psf_id: str) -> psf_lookup.Tables:
     """The tables of a PSF. Raises ``Problem`` 404 if there is no such PSF, 409 "no-tables" if it has no tables yet."""
     row = state.row(PsfRow, psf_id, caller.owner)
     return _read(state, row, _tables_of(row))
@@ -202,11 +202,11 @@ def _answer(
         return JSONResponse(ask(*tables), headers=headers)
 
 
-def _read(state: Shared, row: PsfRow, digest: str) -> Mapping[str, Any]:
+def _read(state: Shared, row: PsfRow, digest: str) -> psf_lookup.Tables:
     tables = files.json_of(state.store, digest)
     if tables["schema"] != psf_lookup.SCHEMA:
         raise _no_tables(row)
-    return tables
+    return cast("psf_lookup.Tables", tables)
 
 
 def _tables_of(row: PsfRow) -> str:

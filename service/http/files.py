@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Generic, Self
+from typing import Any, Generic, Self, cast
 
 from fastapi import Request
 from fastapi.concurrency import run_in_threadpool
@@ -99,8 +99,7 @@ def not_modified(request: Request, headers: dict[str, str]) -> Response | None:
 
 def json_of(store: Store, digest: str, size: int | None = None) -> dict[str, Any]:
     """The content of a stored JSON file. Errors and size: as for ``path_of``."""
-    content: dict[str, Any] = json.loads(path_of(store, digest, size).read_bytes())
-    return content
+    return cast("dict[str, Any]", json.loads(path_of(store, digest, size).read_bytes()))
 
 
 def path_of(store: Store, digest: str, size: int | None = None) -> Path:
@@ -183,8 +182,7 @@ class Kind(Generic[Row]):
 
     def most_bytes(self, state: State) -> int:
         """Largest file of this kind, bytes."""
-        limit: int = getattr(state.settings, self.limit)
-        return limit
+        return int(getattr(state.settings, self.limit))
 
     def check_start(self, start: bytes, *, whole: bool) -> None:
         """Raise ``Problem`` 415 if a file of this kind cannot start with these bytes."""

@@ -312,7 +312,7 @@ class JsonRequest(Request):
         return await run_in_threadpool(parsed)
 
 
-def _texts_in(value: Any) -> Iterator[str]:
+def _texts_in(value: object) -> Iterator[str]:
     """The texts in a value of JSON, with the names of its members."""
     left = [value]
     while left:

@@ -98,7 +98,7 @@ def start(response: Response, caller: PageBulk, state: Shared, form: SentForm) -
             "nothing-to-deconvolve",
             "expected uploaded images without a product; each of your images has one: upload other images first",
         )
-    body: BulkRequest = checked(BulkRequest, {**parts, "images": list(images)})
+    body = checked(BulkRequest, {**parts, "images": list(images)})
     return RedirectResponse(f"/bulk/{submit_bulk(body, response, caller, state).id}", 303)
 
 
@@ -173,8 +173,7 @@ def _folder_run(form: Sent) -> BulkRequest:
         )
     output = {"folder": folder, "only": bool(text(form, "only")), "layout": text(form, "layout") or None}
     values = {"files": [{"glob": pattern}], "output": output if folder else None, **_common_parts(form)}
-    body: BulkRequest = checked(BulkRequest, values)
-    return body
+    return checked(BulkRequest, values)
 
 
 # --- a run ------------------------------------------------------------------------------------------------

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar, cast
 from urllib.parse import urlencode
 
 from annotated_types import Ge, Le, MultipleOf
@@ -24,6 +24,7 @@ from workers.contract.requests import METHOD_MODELS, METHODS, DefaultMethod
 from workers.contract.suggestions import explained
 
 Sent = Mapping[str, str | UploadFile]
+Checked = TypeVar("Checked")
 
 
 async def _sent_form(request: Request) -> Sent:
@@ -82,14 +83,14 @@ def number_field(kind: str, name: str) -> Markup:
     )
 
 
-def checked(model: Any, values: Mapping[str, Any], *, above: int = 0) -> Any:
+def checked(model: Callable[..., Checked], values: Mapping[str, object], *, above: int = 0) -> Checked:
     """The model with these values; or what a function returns for them.
 
     above: how many names to remove from the start of each field's path (``loc``), because they are levels of the model and
     not fields of the form. Raises ``Problem`` 422, which names each wrong field.
     """
     try:
-        return _adapter(model).validate_python(dict(values))
+        return cast("Checked", _adapter(model).validate_python(dict(values)))
     except ValidationError as error:
         lines = [
             f"{'.'.join(map(str, one['loc'][above:])) or 'the form'}: {explanation}"
@@ -98,14 +99,13 @@ def checked(model: Any, values: Mapping[str, Any], *, above: int = 0) -> Any:
         raise Problem(422, "invalid-request", "; ".join(lines)) from error
 
 
-def job_request(kind: str, values: Mapping[str, Any]) -> JobRequest:
+def job_request(kind: str, values: Mapping[str, object]) -> JobRequest:
     """The request for a job with these parameters. Raises ``Problem`` 422, which names each wrong parameter."""
     body = {"kind": kind, "parameters": dict(values)}
-    request: JobRequest = checked(JobRequest, body, above=len(("kind", "parameters")))
-    return request
+    return checked(JobRequest, body, above=len(("kind", "parameters")))
 
 
-def start_job(kind: str, values: Mapping[str, Any], caller: Caller, state: State) -> Response:
+def start_job(kind: str, values: Mapping[str, object], caller: Caller, state: State) -> Response:
     """Submit a job, and go to its page. Equal requests lead to the same job."""
     request = job_request(kind, values)
     job = submit_job(request, Response(), caller, state)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Annotated, Any, TypeVar, get_args
 
 from fastapi import APIRouter, Query, Request, Response
@@ -50,7 +50,6 @@ CORE_PX = 129
 FILTERS = ("instrument", "channel", "kind", "name", "version", "status", "valid_at")
 # Entries of the provenance that say when and where a PSF was made, not how.
 NOT_PARAMETERS = ("psf_id", "job_id", "file", "history", "instrument_toml")
-Tables = Mapping[str, Any]
 Thing = TypeVar("Thing")
 router = APIRouter(prefix="/psfs", include_in_schema=False)
 
@@ -59,7 +58,7 @@ router = APIRouter(prefix="/psfs", include_in_schema=False)
 def psf_list(request: Request, caller: PageReading, state: Shared, cursor: Cursor = None) -> Response:
     """PSFs, newest first, with the filters of the API."""
     asked = _asked(request)
-    filters: PsfFilter = checked(psf_filter, {name: asked[name] for name in FILTERS if name in asked})
+    filters = checked(psf_filter, {name: asked[name] for name in FILTERS if name in asked})
     found = list_psfs(Listing(request, PER_PAGE, cursor), caller, state, filters, asked.get("context"))
     return page(
         request,
@@ -163,7 +162,7 @@ def change(psf_id: Identity, caller: PageCertifying, state: Shared, form: SentFo
 @router.post("/{psf_id}/series")
 def change_interpolation(psf_id: Identity, caller: PageCertifying, state: Shared, form: SentForm) -> Response:
     """Say whether the PSFs of the PSF's series may be interpolated in time; then show the PSF."""
-    body: SeriesChange = checked(SeriesChange, filled(form, "interpolated", "reason"))
+    body = checked(SeriesChange, filled(form, "interpolated", "reason"))
     series = get_psf_status(psf_id, caller, state).series
     if series is None:
         raise Problem(
@@ -232,7 +231,7 @@ def validity(psf: PsfView) -> str:
     return f"from {psf.valid_from or 'the beginning'} to {psf.valid_to or 'now and later'}"
 
 
-def _unless(code: str, get: Callable[..., Thing], *args: Any) -> tuple[Thing | None, str | None]:
+def _unless(code: str, get: Callable[..., Thing], *args: object) -> tuple[Thing | None, str | None]:
     """What ``get`` returns, and None; or None, and the reason if it raises a problem with this code."""
     try:
         return get(*args), None
@@ -266,8 +265,7 @@ def _change(form: FormData) -> StatusChange:
     if text(form, "with_range"):
         values |= {name: text(form, name) or None for name in ("valid_from", "valid_to")}
     values["supersedes"] = [one for one in form.getlist("supersedes") if isinstance(one, str)]
-    body: StatusChange = checked(StatusChange, values)
-    return body
+    return checked(StatusChange, values)
 
 
 # --- two PSFs compared ----------------------------------------------------------------------------------
@@ -307,7 +305,7 @@ def comparison(
     )
 
 
-def _compared(one: Tables, other: Tables) -> dict[str, Any]:
+def _compared(one: lookup.Tables, other: lookup.Tables) -> dict[str, Any]:
     """The curves of two PSFs at the radii that both have, and their differences. Raises DataError "plate-scale-mismatch"."""
     figures, both = lookup.compare(one, other), (one, other)
     profiles = [lookup.profile(tables) for tables in both]

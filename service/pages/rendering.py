@@ -63,7 +63,7 @@ def page(
     *,
     status: int = 200,
     headers: Mapping[str, str] | None = None,
-    **shown: Any,
+    **shown: object,
 ) -> HTMLResponse:
     """A page. template: its name. shown: the variables of the template."""
     caller: Caller | None = getattr(request.state, "caller", None)
@@ -200,7 +200,7 @@ def dense(radii: Sequence[float]) -> list[int]:
     return chosen
 
 
-def flat(values: Mapping[str, Any]) -> dict[str, str]:
+def flat(values: Mapping[str, object]) -> dict[str, str]:
     """Nested values as texts. A name contains all levels, separated by dots."""
     texts: dict[str, str] = {}
     for key, value in values.items():
@@ -216,7 +216,7 @@ def flat(values: Mapping[str, Any]) -> dict[str, str]:
     return texts
 
 
-def differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+def differing(one: Mapping[str, object], other: Mapping[str, object]) -> list[tuple[str, str, str]]:
     """The values that differ, which may be nested: the name, and the value of each ("-": it has none)."""
     first, second = flat(one), flat(other)
     rows = [(name, first.get(name, "-"), second.get(name, "-")) for name in {**first, **second}]

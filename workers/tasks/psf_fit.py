@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 from psfcore.errors import module_of_extra
 from psfcore.scatter.fit import fit_json, fit_transit, fitted_psf
 from workers.contract.identities import diffraction_identity
@@ -41,13 +39,12 @@ def psf_fit(workspace: Workspace, request: ResolvedPsfFit, identity: str) -> Non
         "diffraction_psf_id": diffraction_identity(request),
         "fit": {key: report[key] for key in _SHOWN},
     }
-    draw = partial(module_of_extra("psfcore.scatter.plots").fit_png, fit)
     workspace.add(
         psf_result(
             psf,
             identity,
             origin="fitted",
-            draw=draw,
+            draw=lambda path: module_of_extra("psfcore.scatter.plots").fit_png(fit, path),
             report=report,
             details=details,
             threads=workspace.threads,

@@ -15,10 +15,11 @@ import logging
 import time
 from dataclasses import dataclass
 
+from psfcore.arrays import Vector
 from psfcore.errors import DataError
 from psfcore.scatter.inversion import ALGORITHM_VERSION, invert
 from psfcore.scatter.reconstruction import Progress, Solution
-from psfcore.scatter.shapes import Shape, Vector
+from psfcore.scatter.shapes import Shape
 from psfcore.scatter.solution_file import read_solution, write_solution
 from psfcore.transit.transit import Transit
 from workers.catalogue.catalogue import Catalogue

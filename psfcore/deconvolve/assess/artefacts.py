@@ -51,11 +51,11 @@ _SOURCES = 100
 _FEWEST_SOURCES = 3
 _BRIGHTNESS_CLASSES = 16
 
-Plane = NDArray[np.floating[Any]]
+Plane = NDArray[np.floating]
 Flags = NDArray[np.bool_]
 Places = tuple[NDArray[np.intp], ...]
 NoiseAt = Callable[[Places], Plane]  # the noise of the pixels at these positions [y, x], shape (n,)
-Pixels = TypeVar("Pixels", NDArray[np.floating[Any]], NDArray[np.bool_])
+Pixels = TypeVar("Pixels", NDArray[np.floating], NDArray[np.bool_])
 
 
 @dataclass(frozen=True, eq=False)

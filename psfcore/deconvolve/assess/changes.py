@@ -24,7 +24,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from enum import IntFlag
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +46,7 @@ _LARGEST_PCT = 99.0
 Plane = NDArray[np.float64]
 Means = NDArray[np.float32]
 Flags = NDArray[np.bool_]
+Pixel = TypeVar("Pixel", bound=np.generic)
 NEAR_MASKED_PX = 3
 
 
@@ -191,7 +192,7 @@ def block_means(plane: Plane, counted: Flags, block_px: int) -> Plane:
         return np.asarray(_in_blocks(plane, block_px).mean(axis=(1, 3))[whole])
 
 
-def _in_blocks(plane: Any, block_px: int) -> Any:
+def _in_blocks(plane: NDArray[Pixel], block_px: int) -> NDArray[Pixel]:
     """The plane with one axis more for each direction: [block, row in it, block, column in it]."""
     ny, nx = plane.shape[0] // block_px, plane.shape[1] // block_px
     return plane[: ny * block_px, : nx * block_px].reshape(ny, block_px, nx, block_px)
@@ -224,11 +225,11 @@ def _larger_blocks(before: Plane, after: Plane, counted: Flags) -> Iterator[_Blo
             yield _described(before[counted] / block_px**2, after[counted] / block_px**2, block_px)
 
 
-def _joined(plane: Any, join: np.ufunc) -> Any:
+def _joined(plane: NDArray[Pixel], join: np.ufunc) -> NDArray[Pixel]:
     """Each square of 2 x 2 elements joined to one."""
     ny, nx = plane.shape[0] // 2 * 2, plane.shape[1] // 2 * 2
     rows = join(plane[0:ny:2], plane[1:ny:2])
-    return join(rows[:, 0:nx:2], rows[:, 1:nx:2])
+    return np.asarray(join(rows[:, 0:nx:2], rows[:, 1:nx:2]))
 
 
 def _described(old: Plane | Means, new: Plane | Means, block_px: int) -> _Blocks:

@@ -192,9 +192,9 @@ def _local_mean(plane: Plane, counted: NDArray[np.bool_], window_px: float) -> P
     """Gaussian-weighted mean of the counted pixels of `plane`; 0 where no counted pixel is near."""
     if counted.all():
         return np.asarray(gaussian_filter(plane, window_px, mode="reflect", truncate=3.0))
-    weight = gaussian_filter(counted.astype(np.float64), window_px, mode="reflect", truncate=3.0)
-    total = gaussian_filter(np.where(counted, plane, 0.0), window_px, mode="reflect", truncate=3.0)
-    return np.divide(total, weight, out=np.zeros_like(total), where=weight > 1e-6)
+    weight: Plane = gaussian_filter(counted.astype(np.float64), window_px, mode="reflect", truncate=3.0)
+    total: Plane = gaussian_filter(np.where(counted, plane, 0.0), window_px, mode="reflect", truncate=3.0)
+    return np.asarray(np.divide(total, weight, out=np.zeros_like(total), where=weight > 1e-6))
 
 
 def _degrees_of_freedom(total: Plane, squares: Plane, draws: int) -> float:

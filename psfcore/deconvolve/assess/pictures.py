@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize, SymLogNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -34,8 +35,8 @@ from psfcore.drawing.plots import (
     write_png,
 )
 from psfcore.errors import DataError
+from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.cards import optional_text
-from psfcore.fits.header import FitsLimits
 from psfcore.fits.images import read_planes
 from psfcore.fits.observation import read_observation
 
@@ -93,7 +94,7 @@ def _place(index: int) -> AxesBounds:
     return 0.045 + 0.318 * column, 0.555 - 0.465 * row, 0.266, 0.38
 
 
-def _draw_histogram(axes: Any, before: Plane, after: Plane, unit: str) -> None:
+def _draw_histogram(axes: Axes, before: Plane, after: Plane, unit: str) -> None:
     """Histogram of block means before and after, with logarithmic bins."""
     counted = np.isfinite(before) & np.isfinite(after)
     means = [block_means(plane, counted, _HISTOGRAM_BLOCK_PX) for plane in (before, after)]
@@ -104,7 +105,7 @@ def _draw_histogram(axes: Any, before: Plane, after: Plane, unit: str) -> None:
     low = min(float(np.percentile(values, 0.01)) for values in positive)
     bins = np.geomspace(low, max(float(values.max()) for values in positive) * 1.01, 121)
     for values, name, colour in zip(positive, ("before", "after"), (_BEFORE, _AFTER), strict=True):
-        axes.hist(values, bins=bins, histtype="step", color=colour, linewidth=1.6, label=name)
+        axes.hist(values, bins=list(bins), histtype="step", color=colour, linewidth=1.6, label=name)
         for level in np.percentile(values, [1, 99]):
             axes.axvline(level, color=colour, linewidth=0.9, linestyle=(0, (4, 3)))
     axes.set(

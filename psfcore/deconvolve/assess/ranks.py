@@ -8,7 +8,6 @@ the values in these bins, usually a few percent of all, are sorted.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +21,7 @@ _MINUS_ZERO = -(1 << 31)
 _LARGEST = float(np.finfo(np.float32).max)
 
 
-def percentiles(values: NDArray[Any], levels: Sequence[float]) -> NDArray[np.float64]:
+def percentiles(values: NDArray[np.generic], levels: Sequence[float]) -> NDArray[np.float64]:
     """The percentiles of values (n,), which must not be NaN, as `numpy.percentile` computes them, in single precision."""
     with np.errstate(over="ignore"):
         single = np.asarray(values, dtype=np.float32)
@@ -87,7 +86,7 @@ def _at_ranks(
 
 
 @compiled()
-def _bin(bits: Any) -> Any:
+def _bin(bits: int) -> int:
     """The bin of a value with these bits. -0 has the bin of 0: equal values must have equal keys."""
     bits = 0 if bits == _MINUS_ZERO else bits
     return ((bits ^ ((bits >> 31) & 0x7FFFFFFF)) >> _SHIFT) + _BINS // 2

@@ -26,10 +26,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from psfcore.compiled import compiled
-from psfcore.convolution.engine import rows_from_spectrum, rows_to_spectrum
-from psfcore.convolution.fft_kernels import LANES
+from psfcore.convolution.engine import Lines, Single, rows_from_spectrum, rows_to_spectrum
+from psfcore.convolution.lanes import LANES
 from psfcore.deconvolve.conditions import Deconvolved
 from psfcore.deconvolve.iterations.linear import (
     LinearIteration,
@@ -37,7 +38,7 @@ from psfcore.deconvolve.iterations.linear import (
     noise_amplification,
     transfer_sample,
 )
-from psfcore.deconvolve.problem import Problem, relative_change
+from psfcore.deconvolve.problem import Judgement, Problem, relative_change
 from psfcore.errors import DataError
 
 LARGEST_GROWTH = 10.0
@@ -82,7 +83,16 @@ def _check_converges(sample: TransferSample, steps: int) -> None:
 
 
 @compiled(fastmath={"contract", "reassoc"})
-def _step_rows(lines, start, stop, observed, x, new, changes, judgement):  # type: ignore[no-untyped-def]
+def _step_rows(
+    lines: Lines,
+    start: int,
+    stop: int,
+    observed: Single,
+    x: Single,
+    new: Single,
+    changes: NDArray[np.float64],
+    judgement: Judgement,
+) -> None:
     """Compute `new` by Eq. (1) and transform its rows.
 
     Add up (change)^2 and x^2 over all pixels, and (y - H x)^2 / variance over the judged pixels.
@@ -91,7 +101,7 @@ def _step_rows(lines, start, stop, observed, x, new, changes, judgement):  # typ
     zero, least = np.float32(0.0), np.float32(1e-30)
     for block in range(start, stop):
         z = rows_from_spectrum(lines, block)
-        sum_here, moved, total = 0.0, 0.0, 0.0
+        sum_here, moved, total = np.float64(0.0), np.float64(0.0), np.float64(0.0)
         for i in range(nx):
             sum_row, moved_row, total_row = zero, zero, zero
             for side in range(2):

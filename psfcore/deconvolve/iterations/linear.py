@@ -44,11 +44,12 @@ from psfcore.compiled import compiled
 from psfcore.convolution.engine import (
     BLOCK_ROWS,
     Engine,
+    Lines,
     Single,
     rows_from_spectrum,
     rows_to_spectrum,
 )
-from psfcore.convolution.fft_kernels import LANES
+from psfcore.convolution.lanes import LANES
 from psfcore.deconvolve.conditions import Deconvolved
 from psfcore.deconvolve.problem import (
     Iteration,
@@ -73,7 +74,7 @@ def inverse_filter(engine: Engine) -> NDArray[np.float32]:
     """Compute G of Eq. (1) in the layout of the engine's transfer function."""
     scale = np.float32(engine.transfer_scale)
     power = np.square(engine.transfer).sum(axis=2, keepdims=True) * scale**2
-    g = engine.transfer / np.maximum(power, np.float32(LEAST_TRANSFER**2))
+    g: Single = engine.transfer / np.maximum(power, np.float32(LEAST_TRANSFER**2))
     if not engine.symmetric:
         g[:, :, 1] *= -1
     return g
@@ -171,7 +172,9 @@ def noise_amplification(
 
 
 @compiled(fastmath={"contract", "reassoc"})
-def _residual_rows(lines, start, stop, observed, judgement, rows):  # type: ignore[no-untyped-def]
+def _residual_rows(
+    lines: Lines, start: int, stop: int, observed: Single, judgement: Judgement, rows: int
+) -> None:
     """Replace H x by w (y - H x), where y is NaN if w is 0. Add up (y - H x)^2 / variance over the judged pixels.
 
     The result is 0 beyond the number of rows.
@@ -180,7 +183,7 @@ def _residual_rows(lines, start, stop, observed, judgement, rows):  # type: igno
     zero, least = np.float32(0.0), np.float32(1e-30)
     for block in range(start, stop):
         z = rows_from_spectrum(lines, block)
-        sum_here = 0.0
+        sum_here = np.float64(0.0)
         for i in range(nx):
             sum_row = zero
             for side in range(2):
@@ -198,13 +201,15 @@ def _residual_rows(lines, start, stop, observed, judgement, rows):  # type: igno
 
 
 @compiled(fastmath={"contract", "reassoc"})
-def _add_rows(lines, start, stop, x, again, changes, rows):  # type: ignore[no-untyped-def]
+def _add_rows(
+    lines: Lines, start: int, stop: int, x: Single, again: bool, changes: NDArray[np.float64], rows: int
+) -> None:
     """Compute x <- x + G w (y - H x), Eq. (1). Add up (change)^2 and x^2 for each block. x is 0 beyond the number of rows."""
     nx = x.shape[1]
     zero = np.float32(0.0)
     for block in range(start, stop):
         z = rows_from_spectrum(lines, block)
-        moved, total = 0.0, 0.0
+        moved, total = np.float64(0.0), np.float64(0.0)
         for i in range(nx):
             moved_row, total_row = zero, zero
             for side in range(2):
@@ -225,7 +230,7 @@ def _add_rows(lines, start, stop, x, again, changes, rows):  # type: ignore[no-u
 
 
 @compiled()
-def _clear_beyond(z, rows, nx):  # type: ignore[no-untyped-def]
+def _clear_beyond(z: Single, rows: int, nx: int) -> None:
     """Set the rows of a block beyond the number of rows to 0."""
     for row in range(max(rows, 0), 2 * LANES):
         for i in range(nx):

@@ -33,16 +33,15 @@ light that crosses the edge of the margin.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.compiled import compiled
-from psfcore.convolution.engine import rows_from_spectrum, rows_to_spectrum
-from psfcore.convolution.fft_kernels import LANES
+from psfcore.convolution.engine import Lines, Single, rows_from_spectrum, rows_to_spectrum
+from psfcore.convolution.lanes import LANES
 from psfcore.deconvolve.problem import (
     Iteration,
+    Judgement,
     Problem,
     first_estimate,
     relative_change,
@@ -56,10 +55,8 @@ FLOOR_OF_MAXIMUM = 2.0**-23
 # An estimate below this fraction of the floor is set to 0.
 DARK_OF_FLOOR = 1e-6
 # The compiler may reorder a sum within a block. The new order is fixed, so it does not depend on the threads.
-_SUMS: Any = {"contract", "reassoc"}
+_SUMS = {"contract", "reassoc"}
 _SUMMED = 16 * LANES
-
-Single = NDArray[np.float32]
 
 
 class LucyIteration(Iteration):
@@ -128,14 +125,16 @@ def agreed(problem: Problem) -> Single | float:
 
 
 @compiled(fastmath=_SUMS, error_model="numpy")
-def _ratio_rows(lines, start, stop, light, floor, judgement):  # type: ignore[no-untyped-def]
+def _ratio_rows(
+    lines: Lines, start: int, stop: int, light: Single, floor: np.float32, judgement: Judgement
+) -> None:
     """Replace H x, raised to `floor` where it is smaller, by Eq. (2). Add up (y - H x)^2 / variance over the judged
     pixels."""
     nx, judged = light.shape[1], judgement.rows
     zero, least = np.float32(0.0), np.float32(1e-30)
     for block in range(start, stop):
         z = rows_from_spectrum(lines, block)
-        sum_here = 0.0
+        sum_here = np.float64(0.0)
         for i in range(nx):
             sum_row = zero
             for side in range(2):
@@ -158,14 +157,22 @@ def _ratio_rows(lines, start, stop, light, floor, judgement):  # type: ignore[no
 
 
 @compiled(fastmath=_SUMS, error_model="numpy")
-def _update_rows(lines, start, stop, estimate, dark, again, changes):  # type: ignore[no-untyped-def]
+def _update_rows(
+    lines: Lines,
+    start: int,
+    stop: int,
+    estimate: Single,
+    dark: np.float32,
+    again: bool,
+    changes: NDArray[np.float64],
+) -> None:
     """Compute x <- x * correction, Eq. (1). Set values below `dark` to 0. Add up (change)^2 and x^2 for each block."""
     used = estimate.shape[1] * 2 * LANES
     zero, buffer = np.float32(0.0), lines.buffer
     for block in range(start, stop):
         rows_from_spectrum(lines, block)
         whole = estimate[block].reshape(-1)
-        moved, total = 0.0, 0.0
+        moved, total = np.float64(0.0), np.float64(0.0)
         # The sums of short parts are in single precision, so that the compiler can use vector instructions.
         for first in range(0, used, _SUMMED):
             moved_part = zero

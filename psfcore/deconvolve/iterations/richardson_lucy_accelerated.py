@@ -17,8 +17,10 @@ noisy, the noise is therefore also amplified after fewer steps: use the stopping
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from psfcore.compiled import compiled
+from psfcore.convolution.engine import Single
 from psfcore.deconvolve.iterations.richardson_lucy import LucyIteration, agreed, light_above_floor
 from psfcore.deconvolve.problem import Problem, relative_change
 
@@ -77,7 +79,9 @@ class Accelerated(LucyIteration):
 
 
 @compiled(fastmath={"contract", "reassoc"})
-def _correct(planes, dark, sums, start, stop):  # type: ignore[no-untyped-def]
+def _correct(
+    planes: tuple[Single, ...], dark: np.float32, sums: NDArray[np.float64], start: int, stop: int
+) -> None:
     """Compute new <- prediction * correction and gradient <- new - prediction, and the sums for Eq. (3) and the change.
 
     planes: new, prediction, correction, x, gradient.
@@ -87,7 +91,7 @@ def _correct(planes, dark, sums, start, stop):  # type: ignore[no-untyped-def]
     for block in range(start, stop):
         n, p, c = new[block].reshape(-1), prediction[block].reshape(-1), correction[block].reshape(-1)
         o, g = x[block].reshape(-1), gradient[block].reshape(-1)
-        alike, length, moved, total = 0.0, 0.0, 0.0, 0.0
+        alike, length, moved, total = np.float64(0.0), np.float64(0.0), np.float64(0.0), np.float64(0.0)
         for i in range(n.size):
             value = p[i] * max(c[i], zero)
             value = zero if value < dark else value
@@ -101,7 +105,14 @@ def _correct(planes, dark, sums, start, stop):  # type: ignore[no-untyped-def]
 
 
 @compiled(fastmath={"contract"})
-def _predict(planes, a, curvature, dark, start, stop):  # type: ignore[no-untyped-def]
+def _predict(
+    planes: tuple[Single, ...],
+    a: np.float32,
+    curvature: np.float32,
+    dark: np.float32,
+    start: int,
+    stop: int,
+) -> None:
     """Compute the prediction of Eq. (1). Where x is above 0, the prediction is kept above 0.
 
     planes: prediction, x, and x one and two steps before.

@@ -24,8 +24,10 @@ where differences are small, and an area of uniform light breaks up into a patte
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from psfcore.compiled import compiled
+from psfcore.convolution.engine import Single
 from psfcore.deconvolve.iterations.richardson_lucy import LucyIteration, agreed, light_above_floor
 from psfcore.deconvolve.problem import Problem, relative_change
 
@@ -66,7 +68,7 @@ class TotalVariation(LucyIteration):
 
 
 @compiled()
-def _direction(x, row, column, softening):  # type: ignore[no-untyped-def]
+def _direction(x: Single, row: int, column: int, softening: np.float32) -> tuple[np.float32, np.float32]:
     """grad x / |grad x| at a pixel, (along y, along x). Differences beyond the last row and column count as 0."""
     zero = np.float32(0.0)
     here = x[row, column]
@@ -80,7 +82,15 @@ def _direction(x, row, column, softening):  # type: ignore[no-untyped-def]
 
 
 @compiled()
-def _smooth_rows(planes, smoothing, softening, dark, sums, start, stop):  # type: ignore[no-untyped-def]
+def _smooth_rows(
+    planes: tuple[Single, Single, Single],
+    smoothing: np.float32,
+    softening: np.float32,
+    dark: np.float32,
+    sums: NDArray[np.float64],
+    start: int,
+    stop: int,
+) -> None:
     """Compute `new` by Eq. (1) on rows [start, stop). Set values below `dark` to 0. Sum (change)^2 and x^2 by row.
 
     planes: x, correction, new.
@@ -88,7 +98,7 @@ def _smooth_rows(planes, smoothing, softening, dark, sums, start, stop):  # type
     x, correction, new = planes
     zero, one = np.float32(0.0), np.float32(1.0)
     for row in range(start, stop):
-        moved, total = 0.0, 0.0
+        moved, total = np.float64(0.0), np.float64(0.0)
         left = zero
         for column in range(x.shape[1]):
             down, right = _direction(x, row, column, softening)

@@ -9,7 +9,7 @@ import pkgutil
 from collections.abc import Callable
 from functools import cache
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import psfcore.deconvolve.methods
 from psfcore.deconvolve.declaration import Method
@@ -37,8 +37,7 @@ def method_named(name: str) -> Callable[..., Deconvolved]:
 
         values = method.complete(parameters)
         problem = pose(method, image, psf, conditions, steps=values.pop("steps"), stop=stop)
-        estimated: Deconvolved = _modules()[name].deconvolve(problem, **values)
-        return estimated
+        return cast("Deconvolved", _modules()[name].deconvolve(problem, **values))
 
     return deconvolve
 
@@ -49,8 +48,7 @@ def properties_of(name: str) -> Method:
         raise DataError(
             "unknown-method", f"expected one of the methods {', '.join(sorted(_modules()))}; got {name!r}"
         )
-    properties: Method = _modules()[name].METHOD
-    return properties
+    return cast("Method", _modules()[name].METHOD)
 
 
 def method_names() -> list[str]:
