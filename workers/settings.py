@@ -17,7 +17,7 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from psfcore import software_version as software_version
 from psfcore.fits.blocks import FitsLimits
-from psfcore.transit.archive import ArchiveLimits
+from psfcore.transit.admission import ArchiveLimits
 from workers.contract.jobs import Queue, queues_named
 from workers.machine import cores, memory_bytes
 

@@ -33,14 +33,9 @@ from pathlib import PurePath
 from typing import Any
 
 from psfcore.errors import DataError
-from psfcore.fits.header import (
-    FILTER_CARDS,
-    HeaderSummary,
-    bad_time,
-    optional_text,
-    plate_scale_arcsec,
-    utc_time,
-)
+from psfcore.fits.cards import optional_text
+from psfcore.fits.frame import plate_scale_arcsec
+from psfcore.fits.header import FILTER_CARDS, HeaderSummary, bad_time, utc_time
 from psfcore.instruments.files import PLATE_SCALE_TOLERANCE
 from psfcore.instruments.unknown import channel_of as channel_of
 from workers.texts import printable

@@ -175,7 +175,7 @@ def _in_turn(seed: int, count: int, names: Sequence[str], stream: int) -> str:
     repeated."""
     turn, place = divmod(count, len(names))
     order = np.random.default_rng([seed, turn, _KIND_STREAM, 3 + stream]).permutation(len(names))
-    return names[order[place]]
+    return str(names[order[place]])
 
 
 def _plan(size_px: int, images: int, rng: np.random.Generator) -> Plan:

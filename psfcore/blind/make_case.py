@@ -110,9 +110,11 @@ def _map(change: Plane) -> list[list[float]]:
     step = change.shape[0] / MAP_POINTS
     at = (np.arange(MAP_POINTS) + 0.5) * step - 0.5
     boxes = uniform_filter(change, max(1, round(step)), mode="nearest")
-    return np.round(
-        map_coordinates(boxes, np.meshgrid(at, at, indexing="ij"), order=1, mode="nearest"), 4
-    ).tolist()
+    return list(
+        np.round(
+            map_coordinates(boxes, np.meshgrid(at, at, indexing="ij"), order=1, mode="nearest"), 4
+        ).tolist()
+    )
 
 
 def _at_target(

@@ -180,7 +180,7 @@ def fraunhofer_field(openings_mm: Vector, grid: Grid, focal_length_mm: float) ->
 
 def binned_light(field: Wave, grid: Grid, samples_per_pixel: int) -> Vector:
     """The light in each pixel: the sum of abs(E)^2 over the samples of the pixel, times the step."""
-    return (np.abs(field) ** 2).reshape(-1, samples_per_pixel).sum(axis=1) * grid.step_mm
+    return np.asarray((np.abs(field) ** 2).reshape(-1, samples_per_pixel).sum(axis=1) * grid.step_mm)
 
 
 def line_light_beyond(line: Vector, radii_px: Sequence[int] | NDArray[np.integer]) -> Vector:

@@ -37,7 +37,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.compiled import compiled
-from psfcore.convolution.fft_kernels import LANES, forward, make_plan
+from psfcore.convolution.fft_kernels import forward, make_plan
+from psfcore.convolution.lanes import LANES
 from psfcore.convolution.lengths import LARGEST_LENGTH, good_length
 from psfcore.diffraction.pupil import MaskGrid
 

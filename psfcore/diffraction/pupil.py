@@ -130,7 +130,7 @@ def bar(start_mm: float, end_mm: float, width_mm: float, angle_deg: float) -> Co
     half_mm = width_mm / 2
     corners = np.array([(start_mm, -half_mm), (end_mm, -half_mm), (end_mm, half_mm), (start_mm, half_mm)])
     cos, sin = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
-    return corners @ np.array([[cos, -sin], [sin, cos]]).T
+    return np.asarray(corners @ np.array([[cos, -sin], [sin, cos]]).T)
 
 
 def _mount_outlines(mount: Mount, rim_mm: float) -> list[Outline]:

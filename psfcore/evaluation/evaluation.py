@@ -202,7 +202,7 @@ class Superposed:
     @property
     def half_px(self) -> int:
         """The index of the centre in both axes."""
-        return self.count.shape[0] // 2
+        return int(self.count.shape[0] // 2)
 
 
 def superposed(pe_pct: Plane, noise_pct: Plane) -> Superposed:

@@ -94,7 +94,7 @@ class ArmMeasurement:
 
 
 # The matrices are so small that threads cost several times more time than they save.
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@threadpool_limits.wrap(limits=1, user_api="blas")  # type: ignore[untyped-decorator]  # threadpoolctl has no types
 def measure_arms(
     image: Plane,
     centre_xy: tuple[float, float] | None = None,

@@ -127,7 +127,7 @@ def _measured_arm(
         )
     except DataError as error:
         raise DataError(error.code, f"{error.message}; or give the direction with --arm") from error
-    return min(found.angles_deg, key=abs)
+    return float(min(found.angles_deg, key=abs))
 
 
 def summary_lines(found: FlareComparison) -> list[str]:

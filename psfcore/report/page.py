@@ -30,7 +30,7 @@ from psfcore.scatter.reconstruction import DARK_MARGIN_PX, DARK_MARGIN_SIGMAS, L
 from psfcore.scatter.total_psf import SCATTER
 from psfcore.scatter.validation.cross_validation import RUNS
 from psfcore.scatter.validation.robustness import DarkOffsetStudy
-from psfcore.tables.make import TOTAL
+from psfcore.tables.lookup import TOTAL
 from psfcore.transit.transit import folds
 
 Row = list[str]

@@ -40,7 +40,7 @@ from psfcore.scatter.fit import RADII_PX, TransitFit
 from psfcore.scatter.total_psf import DIFFRACTION, SCATTER
 from psfcore.scatter.validation.cross_validation import ShellBands
 from psfcore.scatter.validation.robustness import DarkOffsetStudy
-from psfcore.tables.make import TOTAL
+from psfcore.tables.lookup import TOTAL
 
 WIDTH_IN = 9.9
 MOST_SLICES = 6

@@ -40,6 +40,7 @@ from psfcore.scatter.validation.cross_validation import (
     shared_fits,
 )
 from psfcore.scatter.validation.robustness import OFFSETS_DN, DarkOffsetStudy, dark_offset_study
+from psfcore.tables.lookup import Tables
 from psfcore.tables.make import tables_of
 from psfcore.transit.prepare import Prepared
 from psfcore.transit.transit import Transit
@@ -88,7 +89,7 @@ class PsfReport:
     transit: Transit
     prepared: Prepared
     psf: Psf
-    tables: dict[str, Any]
+    tables: Tables
     evaluation: Evaluation
     fitted_to_these: bool
     missing: tuple[Missing, ...]
@@ -108,7 +109,7 @@ class PsfReport:
         """The summary at the top of the report."""
         judged = sentence(self.evaluation)
         if self.fit is not None:
-            return fit_json(self.fit)["sentence"] + f" {self.how_judged}. {judged}"
+            return str(fit_json(self.fit)["sentence"] + f" {self.how_judged}. {judged}")
         return f"PSF {self.psf.name} {self.psf.version}. {self.how_judged}. {judged}"
 
     @property

@@ -221,8 +221,11 @@ def power_law_fit(
     def solve(matrix: Matrix, target: Vector) -> tuple[Vector, float]:
         # a, b and c are strongly correlated. The fit uses the weight at PIVOT_PX instead of a, because the data
         # determine this weight well.
+        def misfit(theta: Vector) -> Vector:
+            return np.asarray(matrix @ mean(theta) - target)
+
         solved = least_squares(
-            lambda theta: np.asarray(matrix @ mean(theta) - target),
+            misfit,
             pivot_start,
             method="trf",
             bounds=([-np.inf, np.log(0.05), 0.5], [np.inf, np.log(500.0), 8.0]),

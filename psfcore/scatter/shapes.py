@@ -194,8 +194,10 @@ def _softened(values: Values) -> Radial:
 
 
 def _stretched(values: Values, size: int) -> Kernel:
-    return _power_law_of_ellipses(
-        size, values["b_px"], values["c"], values.get("stretch_p", 0.0), values.get("stretch_q", 0.0)
+    return np.asarray(
+        _power_law_of_ellipses(
+            size, values["b_px"], values["c"], values.get("stretch_p", 0.0), values.get("stretch_q", 0.0)
+        )
     )
 
 

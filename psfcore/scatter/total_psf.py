@@ -51,7 +51,7 @@ from numpy.typing import NDArray
 from psfcore.arrays import Kernel, Matrix, Vector
 from psfcore.convolution.convolver import Convolver
 from psfcore.convolution.engine import BLOCK_ROWS, Engine
-from psfcore.convolution.fft_kernels import LANES
+from psfcore.convolution.lanes import LANES
 from psfcore.deconvolve.assess.error_planes import sigma_points
 from psfcore.deconvolve.iterations.linear import inverse_filter, solve_linear, transfer_sample
 from psfcore.errors import DataError
@@ -115,7 +115,7 @@ def curve_sigma(slopes: Iterable[Kernel], covariance: Matrix, radii_px: Vector) 
     """
     of_curve = np.stack([-100 * encircled_energy(slope, radii_px) for slope in slopes], axis=1)
     variance = np.einsum("rk,kl,rl->r", of_curve, covariance, of_curve)
-    return np.sqrt(np.maximum(variance, 0.0))
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
 def fit_of(psf: Psf) -> FittedShape:

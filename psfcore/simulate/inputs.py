@@ -238,7 +238,8 @@ def diffraction_kernel(
     kernel = build_psf(
         load_instrument(instrument), size=size, component="DIFFRACTION", threads=threads
     ).kernel
-    return kernel / kernel.sum()
+    weights: Plane = kernel / kernel.sum()
+    return weights
 
 
 def scenes_from_files(files: Sequence[Path], plan: Plan, limits: FitsLimits) -> dict[int, Plane] | None:

@@ -218,7 +218,7 @@ def _results_for(image: Path, output: Path) -> tuple[Path, Path]:
 def _simulated(service: Client, output: Path, progress: Progress) -> Path:
     """A simulated image, convolved with the PSF that the service builds."""
     # The simulation is imported here, because a demo with the user's own image does not need it.
-    from psfcore.fits.header import FitsLimits
+    from psfcore.fits.blocks import FitsLimits
     from psfcore.fits.psfs import read_psf
     from psfcore.simulate.scene import demo_image
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote, unquote_to_bytes
 
 from psfcore.errors import DataError
-from psfcore.fits.header import FitsLimits
+from psfcore.fits.blocks import FitsLimits
 from workers.catalogue.bulks import NOT_UTF_8, TOO_LONG, BulkImage
 from workers.catalogue.tables import MOST_LETTERS, BulkRow
 from workers.contract.bulk import BulkWork, Condition

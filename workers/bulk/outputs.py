@@ -11,7 +11,9 @@ from typing import Any
 
 from psfcore.errors import DataError
 from psfcore.files import sha256_of
-from psfcore.fits.header import FitsLimits, optional_text, read_first_image
+from psfcore.fits.blocks import FitsLimits
+from psfcore.fits.cards import optional_text
+from psfcore.fits.header import read_first_image
 from workers.contract.bulk import MOST_IN_PATH, FieldValue, Output, laid_out
 from workers.files import archive as archive_files
 from workers.files.store import is_disk_full

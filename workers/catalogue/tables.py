@@ -41,7 +41,7 @@ class Base(DeclarativeBase):
     @classmethod
     def thing(cls) -> str:
         """The name of what a row describes, for example "image"."""
-        return cls.__tablename__.removesuffix("s")
+        return str(cls.__tablename__.removesuffix("s"))
 
 
 _RELEASED = text("status IN ('certified', 'deprecated')")

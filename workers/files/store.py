@@ -28,7 +28,8 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from psfcore.errors import DataError, module_of_extra
 from psfcore.files import sha256_of
-from psfcore.transit.archive import ArchiveLimits, unpack
+from psfcore.transit.admission import ArchiveLimits
+from psfcore.transit.archive import unpack
 from workers.settings import Settings
 
 ADVICE = (

@@ -47,4 +47,4 @@ def job_s(kind: str, parameters: Mapping[str, Any], pixels: float) -> float:
     cpu_s = cost.base_s + cost.pixel_ns * 1e-9 * pixels
     for parameter, factor in cost.times.items():
         cpu_s *= factor if parameters.get(parameter) else 1.0
-    return cpu_s * (1 + cost.runs.get(parameters.get("scheme", ""), 0.0) * parameters.get("runs", 0))
+    return float(cpu_s * (1 + cost.runs.get(parameters.get("scheme", ""), 0.0) * parameters.get("runs", 0)))

@@ -48,7 +48,7 @@ def intensity_gradient(effect: Effect, seen: Plane, moment: Moment) -> Plane:
     along, across = unit_coordinates(seen.shape, effect["angle_deg"])
     plane = along + effect["curvature"] * (along**2 - across**2)
     plane = plane - plane.min()
-    return seen + effect.strength * plane / plane.mean()
+    return np.asarray(seen + effect.strength * plane / plane.mean())
 
 
 @declare(
@@ -65,7 +65,7 @@ def intensity_gradient(effect: Effect, seen: Plane, moment: Moment) -> Plane:
 def glow(effect: Effect, seen: Plane, moment: Moment) -> Plane:
     """A glow at a fixed position on the detector: an amplifier beside the pixels emits light."""
     r = np.hypot(*unit_coordinates(seen.shape, at=effect["at"])) / effect["scale"]
-    return seen + effect.strength / (1 + r**2) ** 2
+    return np.asarray(seen + effect.strength / (1 + r**2) ** 2)
 
 
 def _specks(plan: Plan, rng: np.random.Generator) -> tuple[tuple[float, float, float], ...]:
@@ -130,7 +130,7 @@ def shutter_gradient(effect: Effect, rate: Plane, moment: Moment) -> Plane:
 def dark_current_drift(effect: Effect, rate: Plane, moment: Moment) -> Plane:
     """The detector warms: a dark current grows during the transit and reaches the strength at its end."""
     steepness = effect["steepness"]
-    return rate + effect.strength * np.expm1(steepness * moment.elapsed) / np.expm1(steepness)
+    return np.asarray(rate + effect.strength * np.expm1(steepness * moment.elapsed) / np.expm1(steepness))
 
 
 @declare(CALIBRATION, "expected", ("response", "core"), "per 1000 DN", 0.02, 0.15)
@@ -156,7 +156,7 @@ def dark_offset(effect: Effect, dn: Plane, moment: Moment, earlier: list[Earlier
     """The subtracted bias was measured on another day: a constant, positive or negative, that varies by 5 % from
     image to image."""
     own = np.random.default_rng([effect["seed"], moment.index]).normal(1.0, 0.05)
-    return dn + effect["sign"] * effect.strength * own
+    return np.asarray(dn + effect["sign"] * effect.strength * own)
 
 
 @declare(KNOWN, "read_out", ("gain_kind",), "share", 0.1, 0.25, sign=sign)

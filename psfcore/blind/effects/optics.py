@@ -125,7 +125,7 @@ def _line(length_px: float, angle_deg: float) -> Plane:
 
     def near(x: Plane, y: Plane) -> Plane:
         beyond = np.maximum(np.abs(x * cos + y * sin) - length_px / 2, 0.0)
-        return np.maximum(1 - FINE * np.hypot(beyond, y * cos - x * sin), 0.0)
+        return np.asarray(np.maximum(1 - FINE * np.hypot(beyond, y * cos - x * sin), 0.0))
 
     return _sampled(length_px / 2 + 1, near)
 

@@ -75,7 +75,7 @@ def out_of_field_light(effect: Effect, seen: Plane, moment: Moment) -> Plane:
     """
     pointing = moment.shot.pointing - 1
     band = _band(seen.shape[0], effect["edges"][pointing], effect["b_px"], effect["c"], effect["a"])
-    return seen + effect.strength * effect["levels"][pointing] * band
+    return np.asarray(seen + effect.strength * effect["levels"][pointing] * band)
 
 
 @cache
@@ -120,7 +120,7 @@ def limb_glint(effect: Effect, seen: Plane, moment: Moment) -> Plane:
     cos, sin = direction(effect["angle_deg"])
     x, y = unit_coordinates(seen.shape, at=(0.5 + 0.8 * cos, 0.5 + 0.8 * sin))
     fan = np.cos(2 * effect["rays"] * np.arctan2(y, x) + np.deg2rad(effect["phase_deg"])) ** 2
-    return seen + effect.strength * (0.2 + fan) * np.exp(-np.hypot(x, y) / 0.5) / np.exp(-1.6)
+    return np.asarray(seen + effect.strength * (0.2 + fan) * np.exp(-np.hypot(x, y) / 0.5) / np.exp(-1.6))
 
 
 def _saturation_level(effect: Effect, exposures: list[Plane], plan: Plan) -> float:

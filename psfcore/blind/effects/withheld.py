@@ -53,7 +53,7 @@ def occulter_tail(effect: Effect, lit: Plane, moment: Moment) -> Plane:
     across = (y[:, None] * cos - x[None, :] * sin) / place.radius_px
     away = np.minimum(np.hypot(np.minimum(along, 0.0), across), 50.0)
     tail = np.exp(-np.maximum(along, 0.0) / effect["length"]) / np.cosh(away) ** 2
-    return lit + effect.strength / (1 + effect["fading"] * moment.elapsed) * tail
+    return np.asarray(lit + effect.strength / (1 + effect["fading"] * moment.elapsed) * tail)
 
 
 @declare(TEST, "covered", ("edge",), "share at the limb", 0.1, 0.9, depth_px=(2.0, 6.0), angle_deg=ANGLE)
@@ -171,7 +171,7 @@ def mount_arc(effect: Effect, seen: Plane, moment: Moment) -> Plane:
     along = along + effect["radius"]  # from the centre of the ring; the arc passes through the point
     turn = np.arctan2(across, along) / np.deg2rad(effect["span_deg"])
     away = (np.hypot(along, across) - effect["radius"]) / effect["width"]
-    return seen + effect.strength * np.cos(np.pi * np.clip(turn, -0.5, 0.5)) / (1 + away**2)
+    return np.asarray(seen + effect.strength * np.cos(np.pi * np.clip(turn, -0.5, 0.5)) / (1 + away**2))
 
 
 @declare(
@@ -216,7 +216,7 @@ def encoder_lamp(effect: Effect, rate: Plane, moment: Moment) -> Plane:
     """The lamp of a position encoder is lit half of the time, at regular intervals: a uniform light, a square wave in
     time."""
     lit = (moment.elapsed / effect["period"] + effect["phase"]) % 1 < 0.5
-    return rate + effect.strength * lit
+    return np.asarray(rate + effect.strength * lit)
 
 
 @declare(
@@ -237,7 +237,7 @@ def stray_beam(effect: Effect, seen: Plane, moment: Moment) -> Plane:
     angle_deg = effect["angle_deg"] + moment.shot.pointing * effect["step_deg"]
     _, across = unit_coordinates(seen.shape, angle_deg, effect["at"])
     left, right = ((across + side * effect["half_width"]) / effect["edge"] for side in (1, -1))
-    return seen + effect.strength * (np.arctan(left) - np.arctan(right)) / np.pi
+    return np.asarray(seen + effect.strength * (np.arctan(left) - np.arctan(right)) / np.pi)
 
 
 @declare(
@@ -246,7 +246,7 @@ def stray_beam(effect: Effect, seen: Plane, moment: Moment) -> Plane:
 def particle_shower(effect: Effect, rate: Plane, moment: Moment) -> Plane:
     """A solar particle event hits the detector: a uniform light that rises fast and decays slowly, with noise."""
     since = max(moment.elapsed - effect["start"], 0.0) / effect["rise"]
-    return rate + effect.strength * since * np.exp(1 - since)
+    return np.asarray(rate + effect.strength * since * np.exp(1 - since))
 
 
 @declare(
@@ -290,4 +290,4 @@ def bias_settling(effect: Effect, dn: Plane, moment: Moment, earlier: list[Earli
     cold = -np.expm1(-wait * len(shots) / max(shots[-1].time_s - shots[0].time_s, 1e-9))
     settling = np.exp(-np.arange(dn.shape[0]) / (effect["rows"] * dn.shape[0]))
     level = settling[::-1] if effect["reversed"] else settling
-    return dn + effect["sign"] * effect.strength * cold * level[:, None]
+    return np.asarray(dn + effect["sign"] * effect.strength * cold * level[:, None])

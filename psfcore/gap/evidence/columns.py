@@ -131,7 +131,7 @@ class FieldColumns:
 
     def count(self, field: Field) -> int:
         """The number of columns of a field."""
-        return self._responses(field).discs.shape[2] * self._modulation(field).shape[1]
+        return int(self._responses(field).discs.shape[2] * self._modulation(field).shape[1])
 
     def squares(self, field: Field) -> list[NDArray[np.intp]]:
         """For a field with bumps on a grid of the detector: the columns of each square of 2 x 2 neighbouring bumps, else an empty list."""

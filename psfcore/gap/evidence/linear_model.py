@@ -152,7 +152,7 @@ class LinearModel:
         known = scaled_inverse(normal[:first, :first] + np.diag(self._prior[others]), weakest=WEAKEST)
         width = self._prior[field] ** -0.5
         left = (normal[first:, first:] - cross.T @ known @ cross) * np.outer(width, width)
-        return np.maximum(np.linalg.eigvalsh(left), 0.0)
+        return np.asarray(np.maximum(np.linalg.eigvalsh(left), 0.0))
 
     @cached_property
     def base(self) -> Step:

@@ -116,7 +116,7 @@ class Evidence:
     @property
     def size(self) -> int:
         """The number of columns."""
-        return self.discs[0].jacobian.shape[0]
+        return int(self.discs[0].jacobian.shape[0])
 
 
 def gather(

@@ -155,7 +155,7 @@ def _curve(values: Vector) -> Matrix | None:
         return None
     x = (values - values.mean()) / spread
     if np.unique(values).size < 3:
-        return x[None, :]
+        return np.asarray(x[None, :])
     bend = x**2 - np.polyval(np.polyfit(x, x**2, 1), x)
     return np.array([x, bend]) if float(bend.std()) > 1e-6 else x[None, :]
 
@@ -212,7 +212,7 @@ def _falls(normal: Matrix, scores: Matrix, columns: list[int]) -> Vector:
     size = np.sqrt(np.maximum(np.diag(normal), 1e-12))
     inverse = np.linalg.pinv(normal / np.outer(size, size), rcond=1e-6, hermitian=True)
     scores = scores / size
-    return np.maximum(np.einsum("ni,ij,nj->n", scores, inverse, scores) - len(columns), 0.0)
+    return np.asarray(np.maximum(np.einsum("ni,ij,nj->n", scores, inverse, scores) - len(columns), 0.0))
 
 
 def shapley(names: list[str], worth: dict[tuple[str, ...], float]) -> dict[str, float]:

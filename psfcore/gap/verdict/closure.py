@@ -172,7 +172,7 @@ def _spread(along: Vector) -> Vector:
 
     along: (parameters, n), the change by one standard deviation of each independent error, in units of the noise.
     """
-    return np.maximum(np.linalg.eigvalsh(along @ along.T), 0.0)
+    return np.asarray(np.maximum(np.linalg.eigvalsh(along @ along.T), 0.0))
 
 
 def _deviance(left: Vector, along: Vector) -> float:
