@@ -3,9 +3,9 @@
     python -m benchmarks [NAME ...] [--write]
 
 NAME: benchmarks to run, by module; default: all, about 20 minutes on two idle cores. --write: replace the stored
-figures of this kind of machine (`benchmarks/stored.json`) by those of this run; figures that were not measured stay. A figure
-that is more than 20 % worse than stored is named as a regression. If a benchmark fails, the others still run; the exit status
-is then 1.
+figures of this kind of machine (`benchmarks/stored.json`) by those of this run; figures that were not measured stay. A
+figure that is more than 20 % worse than stored is named as a regression. If a benchmark fails, the others still run;
+the exit status is then 1.
 """
 
 from __future__ import annotations

@@ -2,14 +2,14 @@
 
     python -m benchmarks.bulk [--images 200] [--size 2048] [--steps 5]
 
-Each worker has one thread and uses Redis and PostgreSQL. For comparison, one and two plain processes do the same work without
-a service. Other work on the machine slows down the service and the plain processes equally.
+Each worker has one thread and uses Redis and PostgreSQL. For comparison, one and two plain processes do the same work
+without a service. Other work on the machine slows down the service and the plain processes equally.
 
 The kernel time is the time that a worker needs to deconvolve the images and to measure the changes. The overhead is the
 time of the worker without the kernel time (waiting for a file to be read, checked or written, hashes, database rows,
 messages) divided by the kernel time. A worker reads the next image and writes the last product while it computes, so
-this work slows the kernels down where all cores are busy. The first image of each worker is left out, because the worker then
-loads its kernels and the PSF.
+this work slows the kernels down where all cores are busy. The first image of each worker is left out, because the
+worker then loads its kernels and the PSF.
 """
 
 from __future__ import annotations

@@ -33,7 +33,8 @@ NOISE = {"photon_gain_dn": 6.0, "read_noise_dn": 2.0}
 
 
 def deconvolved(px: int, psf: int | str, steps: int, method: str = "richardson-lucy", **more: Any) -> Case:
-    """A deconvolution. psf: edge length of a PSF with little scattered light, or "hri_euv", which scatters the most light."""
+    """A deconvolution. psf: edge length of a PSF with little scattered light, or "hri_euv", which scatters the most
+    light."""
     return {"kind": "deconvolve", "px": px, "psf": psf, "method": {"name": method, "steps": steps}} | more
 
 

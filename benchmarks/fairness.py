@@ -2,10 +2,10 @@
 
     python -m benchmarks.fairness [LOAD ...] [--rounds N]
 
-The service runs without a worker. The load comes from a process of its own. Beside it the other owner asks for a list of images,
-on a new connection each time, and uploads images of 20 kB. Each round first measures the idle service. Other work on the machine
-slows all; the processor time that the service uses during a request does not depend on it, and is how long the request takes on
-an idle machine with two cores, if the service is busy.
+The service runs without a worker. The load comes from a process of its own. Beside it the other owner asks for a list
+of images, on a new connection each time, and uploads images of 20 kB. Each round first measures the idle service. Other
+work on the machine slows all; the processor time that the service uses during a request does not depend on it, and is
+how long the request takes on an idle machine with two cores, if the service is busy.
 """
 
 from __future__ import annotations

@@ -1,9 +1,11 @@
-"""The figures that `make bench` compares with their goals and with their stored values, and the parts of pages that programs write.
+"""The figures that `make bench` compares with their goals and with their stored values, and the parts of pages that
+programs write.
 
 A benchmark states a figure by its name with `tell`. `python -m benchmarks` collects the figures of all benchmarks and
-prints the table. `benchmarks/stored.json` has the values of an earlier run on each kind of machine. Times are compared as
-ratios to 1 F of their own run (see benchmarks/timing.py), all other figures as they are. 1 F depends on the memory and the
-transforms of a machine, but the start of a program on its processor, so the ratios of two kinds of machine may differ.
+prints the table. `benchmarks/stored.json` has the values of an earlier run on each kind of machine. Times are compared
+as ratios to 1 F of their own run (see benchmarks/timing.py), all other figures as they are. 1 F depends on the memory
+and the transforms of a machine, but the start of a program on its processor, so the ratios of two kinds of machine may
+differ.
 """
 
 from __future__ import annotations
@@ -78,8 +80,8 @@ class Figure:
 def tell(name: str, value: float, f_s: float | None = None) -> None:
     """Print a figure beside its goal, and add it to the table of `python -m benchmarks` if that runs the benchmark.
 
-    f_s: 1 F of the same run, in s; needed for a figure in seconds. Raises KeyError for a name without a goal, ValueError
-    for a time without f_s.
+    f_s: 1 F of the same run, in s; needed for a figure in seconds. Raises KeyError for a name without a goal,
+    ValueError for a time without f_s.
     """
     wanted = WANTED[name]
     if (wanted.unit == "s") != (f_s is not None):
@@ -125,13 +127,14 @@ def reached(figure: Figure) -> bool:
 
 
 def is_regression(figure: Figure, before: Figure) -> bool:
-    """Whether a figure is worse than before by more than 20 %. A figure in percent must also miss its goal: an overhead of
-    0.2 % after 0.1 % is noise."""
+    """Whether a figure is worse than before by more than 20 %. A figure in percent must also miss its goal: an overhead
+    of 0.2 % after 0.1 % is noise."""
     return change(figure, before) > REGRESSION and (WANTED[figure.name].unit != "%" or not reached(figure))
 
 
 def line(figure: Figure, before: Figure | None) -> str:
-    """A line of the table: the figure, its ratio to 1 F, its goal, the stored figure, and how many times worse it is."""
+    """A line of the table: the figure, its ratio to 1 F, its goal, the stored figure, and how many times worse it
+    is."""
     wanted = WANTED[figure.name]
     in_f = "" if figure.f_s is None else f"{figure.compared:8.1f} F"
     goal = f"goal {'>=' if wanted.more else '<='} {wanted.goal:g} {wanted.unit}"
@@ -149,7 +152,8 @@ def figure_of(row: Mapping[str, Any]) -> Figure:
 
 
 def table(figures: Iterable[Figure], earlier: Mapping[str, Mapping[str, Any]]) -> str:
-    """The table of all figures beside goals and stored figures, then the regressions and the figures that are missing."""
+    """The table of all figures beside goals and stored figures, then the regressions and the figures that are
+    missing."""
     found = {figure.name: figure for figure in figures}
     before = {name: figure_of(row) for name, row in earlier.items()}
     lines = [line(found[name], before.get(name)) for name in WANTED if name in found]
@@ -164,7 +168,8 @@ def table(figures: Iterable[Figure], earlier: Mapping[str, Mapping[str, Any]]) -
 
 
 def with_part(page: str, name: str, part: str) -> str:
-    """The page with a new part between the comments `begin NAME` and `end NAME`. Raises ValueError if it does not have them."""
+    """The page with a new part between the comments `begin NAME` and `end NAME`. Raises ValueError if it does not have
+    them."""
     begin, end = f"<!-- begin {name} -->\n", f"<!-- end {name} -->\n"
     before, found, rest = page.partition(begin)
     _, there, after = rest.partition(end)

@@ -5,9 +5,10 @@
     python -m benchmarks.growth figures
 
 NAME: image, psf, steps, transit, catalogue or workers; default: all, about ten minutes on two cores. --quick measures
-fewer and smaller points. --most leaves out the points above N. --write replaces the measured numbers in docs/growth/measured.json
-and their figures; without it, the numbers are only printed. Exponents are fitted to the three largest points. memory: the peak of
-every method at 2048 and 4096 px beside its estimate. figures: draw the figures again from the table.
+fewer and smaller points. --most leaves out the points above N. --write replaces the measured numbers in
+docs/growth/measured.json and their figures; without it, the numbers are only printed. Exponents are fitted to the three
+largest points. memory: the peak of every method at 2048 and 4096 px beside its estimate. figures: draw the figures
+again from the table.
 
 Times are the shortest of several runs. They are also printed as ratios to 1 F (see benchmarks/timing.py), which is
 measured before every axis: other work on the machine slows both. Each point is measured in a process of its own.
@@ -84,8 +85,8 @@ def peak_of(work: Callable[[], object]) -> tuple[float, int, int]:
 def deconvolution(case: dict[str, Any]) -> Point:
     """The time of a deconvolution (shortest of `repeats`), and its peak memory besides the image and the PSF.
 
-    More: bytes for each pixel of the transforms, without the result; the estimate of the peak; the peak of the whole process,
-    with Python, its libraries, the image and the PSF.
+    More: bytes for each pixel of the transforms, without the result; the estimate of the peak; the peak of the whole
+    process, with Python, its libraries, the image and the PSF.
     """
     method, steps, size = case.get("method", "richardson-lucy"), case.get("steps", 20), case["size"]
     psf = heliopsf.build_psf("hri_euv")
@@ -121,7 +122,8 @@ def fit(case: dict[str, Any]) -> Point:
 
 def measured(kind: str, n: float, **case: Any) -> Point:
     """The point of a case, measured in a process of its own."""
-    # Freed arrays return to the system at once; otherwise the process would use them again, and the peak would be too low.
+    # Freed arrays return to the system at once; otherwise the process would use them again, and the peak would be too
+    # low.
     words = ("--one", kind, json.dumps({"n": n} | case))
     return Point(**answer_of("benchmarks.growth", *words, MALLOC_MMAP_THRESHOLD_="65536"))
 
@@ -188,7 +190,8 @@ def workers(values: list[int]) -> Iterator[Point]:
 
 @dataclass(frozen=True)
 class Axis:
-    """A quantity. label: its name with its unit. what: what is measured. values, quick: the points, and fewer and smaller ones."""
+    """A quantity. label: its name with its unit. what: what is measured. values, quick: the points, and fewer and
+    smaller ones."""
 
     label: str
     what: str
@@ -200,16 +203,38 @@ class Axis:
 
 SIZES = (256, 512, 1024, 2048, 4096, 8192)
 AXES = {
-    "image": Axis("size of the image (px)", "20 steps of Richardson-Lucy, PSF of 2048 px", image_size, SIZES, SIZES[:4]),
-    "psf": Axis("size of the PSF (px)", "20 steps of Richardson-Lucy, image of 1024 px", psf_size,
-                (64, 128, 256, 512, 1024, 2048), (64, 512, 2048)),
-    "steps": Axis("steps", "Richardson-Lucy, image of 1024 px, PSF of 2048 px", steps, (5, 10, 20, 40, 80, 160), (5, 20)),
-    "transit": Axis("images in a transit", "fit of the scatter, images of 128 px", transit_images,
-                    (10, 30, 100, 200, 500), (10, 30)),
-    "catalogue": Axis("products in the catalogue", "a list or look-up in SQLite (median)", catalogue_rows,
-                      (1_000, 10_000, 100_000, 1_000_000), (1_000, 10_000), "size of the file (MiB)"),
-    "workers": Axis("workers of one thread", f"an image of {BULK_PX} px in a bulk run", workers, (1, 2), (1, 2)),
-}  # fmt: skip
+    "image": Axis(
+        "size of the image (px)", "20 steps of Richardson-Lucy, PSF of 2048 px", image_size, SIZES, SIZES[:4]
+    ),
+    "psf": Axis(
+        "size of the PSF (px)",
+        "20 steps of Richardson-Lucy, image of 1024 px",
+        psf_size,
+        (64, 128, 256, 512, 1024, 2048),
+        (64, 512, 2048),
+    ),
+    "steps": Axis(
+        "steps", "Richardson-Lucy, image of 1024 px, PSF of 2048 px", steps, (5, 10, 20, 40, 80, 160), (5, 20)
+    ),
+    "transit": Axis(
+        "images in a transit",
+        "fit of the scatter, images of 128 px",
+        transit_images,
+        (10, 30, 100, 200, 500),
+        (10, 30),
+    ),
+    "catalogue": Axis(
+        "products in the catalogue",
+        "a list or look-up in SQLite (median)",
+        catalogue_rows,
+        (1_000, 10_000, 100_000, 1_000_000),
+        (1_000, 10_000),
+        "size of the file (MiB)",
+    ),
+    "workers": Axis(
+        "workers of one thread", f"an image of {BULK_PX} px in a bulk run", workers, (1, 2), (1, 2)
+    ),
+}
 
 
 def exponent(n: list[float], values: list[float]) -> float | None:

@@ -66,7 +66,8 @@ def processor_s(code: str, compiled: str) -> float:
 
 
 def start(folder: Path, f_s: float) -> None:
-    """Processor times of imports and of the start of the command, in turn. The first run compiles and is not counted."""
+    """Processor times of imports and of the start of the command, in turn. The first run compiles and is not
+    counted."""
     compiled = str(folder / "compiled")
     runs = [{what: processor_s(code, compiled) for what, code in CODE.items()} for _ in range(STARTS + 1)]
     for what in CODE:

@@ -1,4 +1,5 @@
-"""The unit of time of the benchmarks, the shortest time of several runs, the peak memory of a process, and work in other processes.
+"""The unit of time of the benchmarks, the shortest time of several runs, the peak memory of a process, and work in
+other processes.
 
 The unit 1 F is the time of one 4096 x 4096 float32 rfft2 + irfft2 by SciPy with two workers, measured in the same run.
 Other work on the machine slows this and the benchmark equally, so ratios are more reliable than seconds.
@@ -45,7 +46,8 @@ def reference(clock: Callable[[], float] = time.perf_counter) -> float:
 
 
 def memory_bytes(name: str) -> int:
-    """The memory of this process that Linux counts under this name, for example VmHWM (peak) or VmRSS (now), in bytes."""
+    """The memory of this process that Linux counts under this name, for example VmHWM (peak) or VmRSS (now), in
+    bytes."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return 1024 * int(next(line for line in lines if line.startswith(name)).split()[1])
 

@@ -8,8 +8,8 @@
     ...     client.deconvolve("image.fits", "deconvolved.fits")
 
 The functions compute in this process. ``Client`` sends requests to a service. The service keeps products, versions and
-lineage. ``import heliopsf`` is fast, because each name is imported when it is first used. A name that needs packages of an
-extra (``pip install 'heliopsf[service]'``) raises ``MissingExtra``, which names the extra.
+lineage. ``import heliopsf`` is fast, because each name is imported when it is first used. A name that needs packages of
+an extra (``pip install 'heliopsf[service]'``) raises ``MissingExtra``, which names the extra.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ _MODULES = {
     "service.client.http": "Client",
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names.split()}
-__all__ = sorted(_MODULE_OF)
+__all__ = sorted(_MODULE_OF)  # noqa: PLE0605  # a list
 
 
 def __getattr__(name: str) -> Any:

@@ -80,8 +80,9 @@ def deconvolve(
     Parameters
     ----------
     smap : Map, NDData, NDCube, array, (array, header), HDU, HDUList, path, bytes, Image or list
-        The image. The result is of the same class; for a path, the bytes of a file or an ``Image`` it is a ``Deconvolution``, for a
-        MapSequence a MapSequence. Pixels that are NaN or masked are not used; they are NaN in the result.
+        The image. The result is of the same class; for a path, the bytes of a file or an ``Image`` it is a
+        ``Deconvolution``, for a MapSequence a MapSequence. Pixels that are NaN or masked are not used; they are NaN in
+        the result.
     psf : Psf, path, name, array, optional
         A PSF, its FITS file, the name of a known instrument, an instrument file (TOML), or weights with their centre at
         [ny // 2, nx // 2]. Default: the PSF of the telescope in the header (``psf_for``), without its components. The
@@ -89,8 +90,8 @@ def deconvolve(
     iterations : int, optional
         Number of steps, also called ``steps``. Default: that of the method (Richardson-Lucy: 20; aiapy: 25).
     clip_negative : bool, optional
-        Whether pixels below 0 count as 0. The Richardson-Lucy methods always count them as 0; "linear" and "basic-iterative"
-        do not by default.
+        Whether pixels below 0 count as 0. The Richardson-Lucy methods always count them as 0; "linear" and
+        "basic-iterative" do not by default.
     use_gpu : bool
         Without effect, because heliopsf computes on the processor.
     method : str
@@ -98,8 +99,8 @@ def deconvolve(
     full : bool
         Return a ``Deconvolution`` for every form of image: pixels, QUALITY, errors, changes and plots.
     **options
-        Parameters of the method: ``steps``, ``stop`` ("fixed", or "discrepancy": stop once the residual is like the ``noise``), and its
-        own, such as ``order`` and ``smoothing``. All others are described by ``heliopsf.Options``:
+        Parameters of the method: ``steps``, ``stop`` ("fixed", or "discrepancy": stop once the residual is like the
+        ``noise``), and its own, such as ``order`` and ``smoothing``. All others are described by ``heliopsf.Options``:
 
         - the image: ``hdu``, ``saturation_dn``, ``plate_scale_arcsec``, ``noise``, ``other_channel``, ``again``
         - the result: ``region``, ``region_error``, ``error_draws``, ``edges``, ``margin_px``
@@ -230,8 +231,8 @@ def psf_for(image: Any, *, threads: int | None = None, progress: Progress = None
     DataWarning
         With its ``code``, for what may make the PSF wrong for this image.
     """
-    with on_disk(image) as image:
-        header = header_of(image)
+    with on_disk(image) as there:
+        header = header_of(there)
     psf = _built_for(header, reporter(progress is True, BUILDING), threads=threads or cores(), parts=True)
     for code, message in input_warnings(psf, _header_only(header), None, other_channel=False).items():
         warnings.warn(DataWarning(code, message), stacklevel=2)
@@ -265,7 +266,8 @@ def _clipped(image: Image, *, clip_negative: bool | None, method: str) -> Image:
     if not properties_of(method).may_be_negative:
         raise DataError(
             "negative-pixels",
-            f"clip_negative=False: expected an image without negative pixels, or a method whose results may be negative "
+            "clip_negative=False: expected an image without negative pixels, or a method whose results may be "
+            "negative "
             f'("linear", "basic-iterative"); got {np.count_nonzero(negative)} negative pixels and {method!r}: use '
             "clip_negative=True or another method",
         )

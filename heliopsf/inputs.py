@@ -1,7 +1,8 @@
-"""Images as users have them: files, HDUs, sunpy Maps, NDData and CCDData, arrays; and their regions. Each becomes an ``Image``.
+"""Images as users have them: files, HDUs, sunpy Maps, NDData and CCDData, arrays; and their regions. Each becomes an
+``Image``.
 
-This module does not import ``sunpy``, ``dask`` and ``astropy.nddata``. An object of one of their classes can exist only if
-these modules are already loaded.
+This module does not import ``sunpy``, ``dask`` and ``astropy.nddata``. An object of one of their classes can exist only
+if these modules are already loaded.
 """
 
 from __future__ import annotations
@@ -41,7 +42,8 @@ from psfcore.fits.viewing.regions import moved_header
 from psfcore.image import Image
 
 _EXPECTED = (
-    "a sunpy Map, an NDData, CCDData or NDCube, an array, a pair (array, header), an HDU or HDUList, a path or the bytes of a FITS "
+    "a sunpy Map, an NDData, CCDData or NDCube, an array, a pair (array, header), an HDU or HDUList, a path or the "
+    "bytes of a FITS "
     "file, or a list of these"
 )
 _HDUS = (fits.PrimaryHDU, fits.ImageHDU, fits.CompImageHDU)
@@ -55,7 +57,9 @@ _UNITS = {
 
 @dataclass(frozen=True)
 class _Parts:
-    """An image in memory. data: the pixels, which may not be computed yet. planes: as `psfcore.fits.unusable` has them."""
+    """An image in memory. data: the pixels, which may not be computed yet. planes: as `psfcore.fits.unusable` has
+    them.
+    """
 
     data: Any
     header: Header
@@ -225,7 +229,8 @@ def _chosen(image: Any, number: int | None) -> tuple[int, dict[int, Any]]:
         if wanted and is_hdu(one):
             raise DataError(
                 "three-axes" if len(one.shape) > 2 and len(hdus) > 1 else "not-2d",
-                f"expected an image with two axes; HDU {n} has {len(one.shape)}: choose another HDU, or one plane of it",
+                f"expected an image with two axes; HDU {n} has {len(one.shape)}: choose another HDU, or one plane of "
+                "it",
             )
     raise DataError(
         "no-image",
@@ -253,7 +258,8 @@ def _parts_of(image: Any) -> _Parts:
         parts = _Parts(image, header, {})
     else:
         raise DataError("bad-input", f"expected {_EXPECTED}; got {type(image).__name__}")
-    # The unit is read even if the header gives one, because it may be logarithmic. That of a Map is the one of its header.
+    # The unit is read even if the header gives one, because it may be logarithmic. That of a Map is the one of its
+    # header.
     text = None if is_map(image) and "BUNIT" in header else unit_text(getattr(image, "unit", None))
     if text is not None:
         header.setdefault("BUNIT", text)
@@ -267,7 +273,8 @@ def _computed(data: Any) -> NDArray[np.generic]:
     warnings.warn(
         DataWarning(
             "dask-computed",
-            f"the dask array of {' x '.join(map(str, data.shape[::-1]))} px is computed; the result is an array in memory",
+            f"the dask array of {' x '.join(map(str, data.shape[::-1]))} px is computed; the result is an array in "
+            "memory",
         ),
         stacklevel=5,
     )
@@ -282,7 +289,8 @@ def unit_text(unit: Any) -> str | None:
     if isinstance(unit, units.function.FunctionUnitBase) or logarithmic & set(getattr(unit, "bases", ())):
         raise DataError(
             "bad-unit",
-            f"expected pixels that are proportional to the light, such as DN or DN/s; got the logarithmic unit {unit}: convert "
+            "expected pixels that are proportional to the light, such as DN or DN/s; got the logarithmic unit "
+            f"{unit}: convert "
             "the pixels first",
         )
     pixel_free = unit * units.pix if units.pix in getattr(unit, "bases", ()) else unit
@@ -300,12 +308,13 @@ def _header(meta: Mapping[str, Any]) -> Header:
     for key, value in meta.items():
         name = str(key).upper()
         with suppress(*card_trouble()):
-            if isinstance(value, units.Quantity):
-                value = value.to_value(_UNITS.get(name, value.unit))
-            for line in str(value).splitlines() if name == "HISTORY" else ():
+            plain = (
+                value.to_value(_UNITS.get(name, value.unit)) if isinstance(value, units.Quantity) else value
+            )
+            for line in str(plain).splitlines() if name == "HISTORY" else ():
                 header.add_history(line)
             if name not in _NO_VALUES:
-                header[long_key(name)] = plain_value(value)
+                header[long_key(name)] = plain_value(plain)
     return header
 
 
@@ -329,7 +338,8 @@ def box_of(region: Any, image: Any, hdu: int | None = None) -> Box:
     if not two or not is_map(image):
         raise DataError(
             "bad-region",
-            'expected a region as "x0:x1,y0:y1", as np.s_[y0:y1, x0:x1], or for a Map as its bottom left and top right corner; '
+            'expected a region as "x0:x1,y0:y1", as np.s_[y0:y1, x0:x1], or for a Map as its bottom left and top '
+            "right corner; "
             f"got {region!r:.80}",
         )
     try:

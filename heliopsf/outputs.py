@@ -206,7 +206,8 @@ def in_form_of(image: Any, result: Deconvolution) -> Any:
 
 def used_psf(psf: Psf) -> UsedPsf:
     """The PSF as the cards of a result name it, with the id that a service would use: the id of its recipe or of its
-    file."""
+    file.
+    """
     identity = psf.provenance.get("psf_id")
     if identity is None:  # weights in memory
         identity = hashlib.sha256(f"{psf.kernel.shape}".encode() + psf.kernel.tobytes()).hexdigest()

@@ -1,4 +1,6 @@
-"""Parameters as users give them: numbers in the documented unit, quantities of astropy in any unit that fits, and progress."""
+"""Parameters as users give them: numbers in the documented unit, quantities of astropy in any unit that fits, and
+progress.
+"""
 
 from __future__ import annotations
 
@@ -55,8 +57,8 @@ class Options:
         ``np.s_[y0:y1, x0:x1]``, or for a Map its two corners as ``Map.submap`` takes them. Not with ``error_draws`` and
         ``stop="discrepancy"``.
     region_error : float
-        Bound of the difference from the whole image, as a share of the mean light of the region; it determines the rim that is
-        also deconvolved. The card DCNVBERR has the bound.
+        Bound of the difference from the whole image, as a share of the mean light of the region; it determines the rim
+        that is also deconvolved. The card DCNVBERR has the bound.
     error_draws : int
         Number of noise realisations (2 to 64) for the standard deviation of each pixel, the ``uncertainty`` of the
         result; 8 is a good number. Each takes as long as a deconvolution. 0: no uncertainty.
@@ -126,7 +128,8 @@ def noise_of(noise: object) -> Noise | None:
     if not isinstance(noise, tuple | list | np.ndarray) or len(noise) != 2:
         raise DataError(
             "bad-noise",
-            "noise: expected two numbers, photon gain (DN per photon) and read noise (DN rms), such as noise=(1.12, 1.15); got "
+            "noise: expected two numbers, photon gain (DN per photon) and read noise (DN rms), such as noise=(1.12, "
+            "1.15); got "
             f"{noise!r:.80}",
         )
     gain = number("photon gain", noise[0], *COUNTS, *(one / units.ph for one in COUNTS))
@@ -145,7 +148,8 @@ def level_dn(level: object, header: Cards) -> float | None:
         exposure_s = optional_exposure_s(header)
         if exposure_s is None:
             message = (
-                f"expected XPOSURE or EXPTIME in the header, because saturation_dn is in {level.unit}; got neither: give "
+                f"expected XPOSURE or EXPTIME in the header, because saturation_dn is in {level.unit}; got neither: "
+                "give "
                 "the level in DN"
             )
             raise DataError("no-exposure", message)

@@ -347,8 +347,9 @@ def built_psf(
     threads: int | None = None,
     progress: Steps | None = None,
 ) -> Psf:
-    """As ``build_psf``. turn_deg: for images of a known instrument that are turned by this angle against its detector. parts:
-    False: without the components, which a deconvolution does not need."""
+    """As ``build_psf``. turn_deg: for images of a known instrument that are turned by this angle against its detector.
+    parts: False: without the components, which a deconvolution does not need.
+    """
     if not isinstance(instrument, str | Path):
         names = ", ".join(instrument_names())
         raise DataError(

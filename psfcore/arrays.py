@@ -1,4 +1,5 @@
-"""Arrays of numbers: their kinds, windows and squares, their JSON values and hashes, differences, and the covariance of a fit.
+"""Arrays of numbers: their kinds, windows and squares, their JSON values and hashes, differences, and the covariance of
+a fit.
 
 The covariance is the inverse of a normal matrix whose parameters have different units:
 

@@ -49,14 +49,12 @@ def build_psf(
 ) -> Psf:
     """Compute the total PSF of `instrument`, with its components; its shape is (size, size).
 
-    size: an even number from 64 to 4096 (px).
-    component: build only this component, such as "DIFFRACTION"; the result is then a PSF without components.
-    parts: False: compute only what the total PSF needs, and return it without components. The kernel is the same bit for
-    bit.
-    mount_image: pixels of the mount's mask image [y, x], row 0 at the lowest y (see `psfcore.fits.images`).
-    progress: called with (step, steps); it may raise to stop the work.
-    Raises DataError "bad-size", "unknown-component", "bad-mount", or "bad-instrument-file" if the file describes an
-    instrument that needs arrays that are too large.
+    size: an even number from 64 to 4096 (px). component: build only this component, such as "DIFFRACTION"; the result
+    is then a PSF without components. parts: False: compute only what the total PSF needs, and return it without
+    components. The kernel is the same bit for bit. mount_image: pixels of the mount's mask image [y, x], row 0 at the
+    lowest y (see `psfcore.fits.images`). progress: called with (step, steps); it may raise to stop the work. Raises
+    DataError "bad-size", "unknown-component", "bad-mount", or "bad-instrument-file" if the file describes an instrument
+    that needs arrays that are too large.
     """
     if size % 2 or not SMALLEST_SIZE_PX <= size <= LARGEST_SIZE_PX:
         expected = f"an even size of {SMALLEST_SIZE_PX} to {LARGEST_SIZE_PX} px"
@@ -147,7 +145,8 @@ def build_recipe(
 
 def _on_full_reach(kernel: Kernel) -> tuple[Kernel, float]:
     """Scale the weights so that they sum to 1 on the full reach; also return the share of the light beyond the
-    reach."""
+    reach.
+    """
     # Where there is no light, a Fourier transform gives values of about +-1e-17.
     positive = np.maximum(kernel, 0.0)
     inner = float(crop_centred(positive, (REACH_GRID_PX, REACH_GRID_PX)).sum())

@@ -11,9 +11,9 @@ numba also does not notice when a kernel calls a function of another file and th
 kernel depends on all source files that define kernels. If a power failure left a kernel file incomplete, the file is
 ignored.
 
-A kernel file contains machine code, and loading it executes it. Therefore a folder is used only if nobody else can write
-to it; otherwise the kernels are kept in a private folder of the user's cache. If there is none either, each process
-compiles the kernels again.
+A kernel file contains machine code, and loading it executes it. Therefore a folder is used only if nobody else can
+write to it; otherwise the kernels are kept in a private folder of the user's cache. If there is none either, each
+process compiles the kernels again.
 """
 
 from __future__ import annotations
@@ -92,7 +92,8 @@ class Addressed:
     @cached_property
     def address(self) -> int:
         """The address of the machine code, which is valid until this process ends. The kernel is loaded from disk, or
-        compiled if it is not kept there."""
+        compiled if it is not kept there.
+        """
         kernel: Any = self._kernel
         kernel._cache = KernelCache(self._function)
         kernel.compile()
@@ -104,7 +105,8 @@ def compiled_at_address(
 ) -> Callable[[Callable[..., None]], Addressed]:
     """Decorator for a kernel that is called by its address: `numba.cfunc` with this signature and these options.
 
-    The kernel is compiled when its address is asked for. name: see `compiled`; each kernel of a file needs another name.
+    The kernel is compiled when its address is asked for. name: see `compiled`; each kernel of a file needs another
+    name.
     """
 
     def decorate(function: Callable[..., None]) -> Addressed:
@@ -153,8 +155,9 @@ class KernelCache(FunctionCache):
     def load_overload(self, signature: object, target_context: object) -> object:
         """The machine code for these types of arguments; None if it is not on disk.
 
-        numba's own method first makes all types and functions known to the compiler, which takes longer than to load all
-        kernels of a deconvolution. Machine code only needs the memory of numba's arrays; the compiler prepares itself.
+        numba's own method first makes all types and functions known to the compiler, which takes longer than to load
+        all kernels of a deconvolution. Machine code only needs the memory of numba's arrays; the compiler prepares
+        itself.
         """
         rtsys.initialize(target_context)
         with self._guard_against_spurious_io_errors():
@@ -244,7 +247,9 @@ def trusted(path: Path) -> bool:
 
 
 def is_kept(kernel: object) -> bool:
-    """Whether the disk has machine code of a kernel, compiled from the current sources, for any types of its arguments."""
+    """Whether the disk has machine code of a kernel, compiled from the current sources, for any types of its
+    arguments.
+    """
     return not isinstance(kernel, Dispatcher) or kernel._cache._cache_file.any_kept()  # type: ignore[attr-defined]  # as above
 
 
@@ -269,7 +274,8 @@ class KernelFiles(IndexDataCacheFile):
 
     def load(self, key: object) -> object:
         """The kernel for this key, compiled from the current sources; None if it is not on disk and must be
-        compiled."""
+        compiled.
+        """
         data = self._found(self._name(key))
         if data is None:
             _tell(done=False)

@@ -98,7 +98,8 @@ def missing_extra(error: ModuleNotFoundError) -> ImportError:
 
 def together(errors: Sequence[DataError]) -> DataError:
     """Combine the errors of several files into one error. It has all messages, and the type and code of the first
-    error."""
+    error.
+    """
     first = errors[0]
     if len(errors) == 1:
         return first

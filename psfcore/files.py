@@ -1,5 +1,5 @@
-"""Write files completely or not at all, even if the process is killed or the power fails; hash files; find FITS files by
-their endings.
+"""Write files completely or not at all, even if the process is killed or the power fails; hash files; find FITS files
+by their endings.
 """
 
 from __future__ import annotations

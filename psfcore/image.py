@@ -40,9 +40,8 @@ class Saturation:
 class Image:
     """Pixels [y, x] (float64, in `unit`), mask [y, x] (bits of MaskBit), header, and exposure time in seconds.
 
-    saturation: how the saturated pixels were found; None: this was not recorded. warnings: sentences about the image, by
-    their codes.
-    Raises DataError: "not-2d", "too-small", "mask-shape", "unmasked-nonfinite".
+    saturation: how the saturated pixels were found; None: this was not recorded. warnings: sentences about the image,
+    by their codes. Raises DataError: "not-2d", "too-small", "mask-shape", "unmasked-nonfinite".
     """
 
     pixels: NDArray[np.float64]

@@ -1,12 +1,13 @@
 """Run a function on a file of strangers in a process of its own, behind a wall and with limited memory and time.
 
-C libraries that read such files may crash, hang, use much memory, or return memory that they did not write. Here they do so
-in a process that ends after one file. It is forked from a server process, which has read no file and was started with a new
-environment, so it holds neither other files nor passwords. A fork takes some milliseconds; a new interpreter would take half
-a second. The child can open its file alone, and no socket or program (`psfcore.wall`).
+C libraries that read such files may crash, hang, use much memory, or return memory that they did not write. Here they
+do so in a process that ends after one file. It is forked from a server process, which has read no file and was started
+with a new environment, so it holds neither other files nor passwords. A fork takes some milliseconds; a new interpreter
+would take half a second. The child can open its file alone, and no socket or program (`psfcore.wall`).
 
-The server tells how a child ended that gave no answer. A crash, too much memory and too much processor time are the fault of the
-file. If something else ended the child, it is tried again; if it was stopped or the machine is too busy, the error is an OSError.
+The server tells how a child ended that gave no answer. A crash, too much memory and too much processor time are the
+fault of the file. If something else ended the child, it is tried again; if it was stopped or the machine is too busy,
+the error is an OSError.
 """
 
 from __future__ import annotations
@@ -80,12 +81,13 @@ def run_limited(
 ) -> Answer:
     """Call ``function(target, path=path, **arguments)`` in a child process; returns its answer.
 
-    function: a function of a module that reads the file ``path``. target: an open file, to which it may write. arguments,
-    answer: values that JSON can hold. pixels: the number of pixels of the file, which limits the memory of the child. seconds: the
-    limit of its processor time. answer_bytes: the limit of what it writes to a file; default: what the pixels explain, and no
-    limit if there are none. Raises the DataError, HeaderError or OSError of the function; DataError "unreadable-pixels" if the
-    child crashed, or needed more memory or processor time, or wrote more, than its pixels explain; OSError if the child was ended
-    from outside again and again, or gave no answer in PATIENCE_S.
+    function: a function of a module that reads the file ``path``. target: an open file, to which it may write.
+    arguments, answer: values that JSON can hold. pixels: the number of pixels of the file, which limits the memory of
+    the child. seconds: the limit of its processor time. answer_bytes: the limit of what it writes to a file; default:
+    what the pixels explain, and no limit if there are none. Raises the DataError, HeaderError or OSError of the
+    function; DataError "unreadable-pixels" if the child crashed, or needed more memory or processor time, or wrote
+    more, than its pixels explain; OSError if the child was ended from outside again and again, or gave no answer in
+    PATIENCE_S.
     """
     path, file = Path(path).absolute(), os.stat(path)
     if path.parent == Path("/dev/fd"):  # such a path has a meaning in this process alone
@@ -110,7 +112,8 @@ def run_limited(
         if reply.get("ended") in _OF_FILE:
             raise DataError(
                 "unreadable-pixels",
-                f"expected readable pixels in {path.name}; reading {pixels} pixels crashed, or needed much more memory or time than "
+                f"expected readable pixels in {path.name}; reading {pixels} pixels crashed, or needed much more "
+                "memory or time than "
                 "they explain: copy or make the file again",
             )
         if reply.get("ended") == LATE:
@@ -127,7 +130,9 @@ def run_limited(
 
 
 def _answered(request: bytes, target: BinaryIO) -> Answer:
-    """The answer of a child to a request. If it gave none: "ended" with the signal that ended it, or "lost" if the server ended too."""
+    """The answer of a child to a request. If it gave none: "ended" with the signal that ended it, or "lost" if the
+    server ended too.
+    """
     ours, theirs = socket.socketpair()
     with ours:
         ours.settimeout(PATIENCE_S)
@@ -143,14 +148,18 @@ def _answered(request: bytes, target: BinaryIO) -> Answer:
 
 
 def scratch_file() -> BinaryIO:
-    """A file without a name, which ends with its last use. Behind the wall it is in memory, because no file can be made there."""
+    """A file without a name, which ends with its last use. Behind the wall it is in memory, because no file can be made
+    there.
+    """
     if _is_child and hasattr(os, "memfd_create"):
         return os.fdopen(os.memfd_create("scratch"), "w+b")
     return TemporaryFile()
 
 
 def acting(path: str | Path) -> dict[str, bool]:
-    """Which parts of the wall stand around a child on this machine (`psfcore.wall.walls`). path: any file, which is not read."""
+    """Which parts of the wall stand around a child on this machine (`psfcore.wall.walls`). path: any file, which is not
+    read.
+    """
     with Path(os.devnull).open("wb") as nowhere:
         return run_limited(_walls, path, nowhere, pixels=0)
 

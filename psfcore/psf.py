@@ -55,10 +55,11 @@ class Psf:
     """The weights [y, x] of a PSF, and how they were obtained.
 
     kernel: a weight is the share of a point source's light that a pixel receives; the centre is [ny // 2, nx // 2].
-    components: kernels with the same centre ("DIFFRACTION", "SCATTER"). provenance: texts and numbers for JSON.
-    fitted: the fitted formula of SCATTER. turn_deg: the angle from the +x axis of the detector to that of the kernel. cards: texts of the file's cards TELESCOP, INSTRUME, DETECTOR and FILTER,
-    which say for which images the PSF is valid. Raises DataError: "psf-not-2d", "psf-too-small", "psf-nonfinite", "psf-negative",
-    "psf-sum", "psf-not-centred", "psf-off-centre".
+    components: kernels with the same centre ("DIFFRACTION", "SCATTER"). provenance: texts and numbers for JSON. fitted:
+    the fitted formula of SCATTER. turn_deg: the angle from the +x axis of the detector to that of the kernel. cards:
+    texts of the file's cards TELESCOP, INSTRUME, DETECTOR and FILTER, which say for which images the PSF is valid.
+    Raises DataError: "psf-not-2d", "psf-too-small", "psf-nonfinite", "psf-negative", "psf-sum", "psf-not-centred",
+    "psf-off-centre".
     """
 
     kernel: Kernel
@@ -111,7 +112,8 @@ def _check_weights(kernel: Kernel) -> None:
     if smallest < -1e-12 * max(float(kernel.max()), 0.0):
         raise DataError(
             "psf-negative",
-            f"expected weights >= 0; the smallest is {smallest:.3g}: set negative weights to 0, and divide all by their sum",
+            f"expected weights >= 0; the smallest is {smallest:.3g}: set negative weights to 0, and divide all by "
+            "their sum",
         )
     # The sum is defined over the full reach; a larger array may sum to more than 1.
     within = (min(kernel.shape[0], REACH_GRID_PX), min(kernel.shape[1], REACH_GRID_PX))
@@ -149,7 +151,8 @@ def _check_core(kernel: Kernel) -> None:
     if max(abs(offset_x_px), abs(offset_y_px)) > LARGEST_OFFSET_PX:
         raise DataError(
             "psf-off-centre",
-            f"expected the core of the PSF at the centre of the pixel [ny // 2, nx // 2], within {LARGEST_OFFSET_PX:g} px; got "
+            "expected the core of the PSF at the centre of the pixel [ny // 2, nx // 2], within "
+            f"{LARGEST_OFFSET_PX:g} px; got "
             f"it at x {offset_x_px:+.2f}, y {offset_y_px:+.2f} px from there, which would move every image by as much: "
             "shift the PSF by whole and part pixels, for example with scipy.ndimage.shift",
         )

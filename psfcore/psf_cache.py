@@ -1,8 +1,8 @@
 """A folder of built PSFs, so that a PSF is built only once: `kept_psf` reads a PSF from it, or builds and keeps it.
 
-The name of a file is IDENTITY.PART: the identity of the PSF (`psfcore.recipe`), and the content of the file, such as "fits". A file
-is written under a temporary name and then renamed; when it is read, the card CHECKSUM of its HDUs proves that it is whole. If the
-files need more space than allowed, the files of the least recently used PSF are removed.
+The name of a file is IDENTITY.PART: the identity of the PSF (`psfcore.recipe`), and the content of the file, such as
+"fits". A file is written under a temporary name and then renamed; when it is read, the card CHECKSUM of its HDUs proves
+that it is whole. If the files need more space than allowed, the files of the least recently used PSF are removed.
 
 Other users have no access to the folder, because the files in it are used without any other check.
 """
@@ -127,7 +127,8 @@ class PsfCache:
         return sorted(path for path in found if pattern.fullmatch(path.name))
 
     def _shrink(self, most_bytes: int, last: str = "", *, abandoned_s: float = _ABANDONED_S) -> int:
-        """Remove the least recently used PSFs until the others fit, and what killed processes left; returns the size of these PSFs.
+        """Remove the least recently used PSFs until the others fit, and what killed processes left; returns the size of
+        these PSFs.
 
         The PSF with the identity ``last`` is never removed.
         """
@@ -153,7 +154,8 @@ class PsfCache:
         if not self._ours():
             raise DataError(
                 "cache-of-another-user",
-                f"expected the folder {self.folder} to belong to you; it belongs to another user: name another folder with "
+                f"expected the folder {self.folder} to belong to you; it belongs to another user: name another folder "
+                "with "
                 "HELIOPSF_CACHE_DIR",
             )
         if self.folder.stat().st_mode & _OTHERS:
@@ -161,7 +163,8 @@ class PsfCache:
 
 
 def _whole(path: Path) -> bool:
-    """Whether a FITS file is as it was written: in ones' complement, the 32-bit words of each HDU with the card CHECKSUM sum to -0.
+    """Whether a FITS file is as it was written: in ones' complement, the 32-bit words of each HDU with the card
+    CHECKSUM sum to -0.
 
     FITS standard 4.0, Appendix J.
     """
@@ -186,9 +189,9 @@ def built_file(
 ) -> Iterator[tuple[Path, dict[str, Any]]]:
     """The file of the PSF of a recipe and its provenance: from the cache, or built and kept there.
 
-    parts: False: the PSF without its components, which is built in less time. If the components are asked for later, the PSF is
-    built again; its kernel is the same. progress is called while the PSF is built. If the cache cannot be used, the PSF is
-    built in every call, with a warning.
+    parts: False: the PSF without its components, which is built in less time. If the components are asked for later,
+    the PSF is built again; its kernel is the same. progress is called while the PSF is built. If the cache cannot be
+    used, the PSF is built in every call, with a warning.
     """
     identity = recipe.identity
     fits = cache.find(identity) or (None if parts else cache.find(identity, TOTAL_FITS))

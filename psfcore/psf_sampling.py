@@ -15,8 +15,9 @@ A cut-out, or a window that starts at another pixel of the detector (PXBEG), has
 because one PSF is used for the whole field: only the difference of two positions matters. Near the edges of a window,
 light from outside the window enters the image; no choice of the PSF can correct this.
 
-If the image was turned by quarter turns or flipped after it was taken, so is the PSF of its detector, which is exact. Its core
-and its arms are too narrow to be interpolated, so for other angles a PSF is built anew from the instrument file.
+If the image was turned by quarter turns or flipped after it was taken, so is the PSF of its detector, which is exact.
+Its core and its arms are too narrow to be interpolated, so for other angles a PSF is built anew from the instrument
+file.
 
 | symbol | name | unit |
 |---|---|---|
@@ -63,7 +64,8 @@ def with_scale(psf: Psf, plate_scale_arcsec: float | None) -> Psf:
     if psf.plate_scale_arcsec is not None:
         raise DataError(
             "plate-scale-known",
-            f"expected a PSF without plate scale; PSF {psf.name} has {psf.plate_scale_arcsec:g} arcsec/px: leave the plate scale "
+            f"expected a PSF without plate scale; PSF {psf.name} has {psf.plate_scale_arcsec:g} arcsec/px: leave the "
+            "plate scale "
             "out",
         )
     return replace(psf, plate_scale_arcsec=plate_scale_arcsec)
@@ -81,7 +83,9 @@ def sampling_of(psf: Psf, header: Cards) -> Sampling:
 
 
 def psf_for_image(psf: Psf, header: Header) -> Psf:
-    """The PSF for the pixels of an image with this header: `psf` itself, or `psf` rebinned and turned with the image."""
+    """The PSF for the pixels of an image with this header: `psf` itself, or `psf` rebinned and turned with the
+    image.
+    """
     return sampling_of(psf, header).of(psf)
 
 
@@ -118,12 +122,14 @@ def frame_warnings(psf: Psf, header: Cards) -> dict[str, str]:
     how = "mirrored" if frame.flipped else f"turned by {frame.turn_deg:.3g} degrees"
     if not frame.flipped and abs(frame.turn_deg - psf.turn_deg) <= SILENT_DEG < abs(psf.turn_deg):
         warnings["frame"] = (
-            f"the image is {how} against the detector and interpolated; the PSF was built at this angle: the image before the "
+            f"the image is {how} against the detector and interpolated; the PSF was built at this angle: the image "
+            "before the "
             "turn gives a better result"
         )
     elif psf.turn_deg:
         warnings["frame"] = (
-            f"the PSF was built for images that are turned by {psf.turn_deg:.3g} degrees; the image is {how}: use another PSF"
+            f"the PSF was built for images that are turned by {psf.turn_deg:.3g} degrees; the image is {how}: use "
+            "another PSF"
         )
     elif turn is None:
         advice = "use the image before the turn"
@@ -188,8 +194,9 @@ def rebinned(psf: Psf, factor: int) -> Psf:
 
 
 def rebinned_kernel(kernel: Kernel, factor: int) -> Kernel:
-    """Eq. (1) along both axes; the sum of the used weights is unchanged. Of a larger array that sums to 1 over the full reach
-    (in unbinned pixels), only the weights within the reach are used."""
+    """Eq. (1) along both axes; the sum of the used weights is unchanged. Of a larger array that sums to 1 over the full
+    reach (in unbinned pixels), only the weights within the reach are used.
+    """
     inner = crop_centred(kernel, (min(kernel.shape[0], REACH_GRID_PX), min(kernel.shape[1], REACH_GRID_PX)))
     if inner.sum() < 2 - LARGEST_SUM and kernel.sum() <= LARGEST_SUM:  # it sums to 1 over the whole array
         inner = kernel

@@ -1,10 +1,10 @@
 """PSFs that others published: where they are, what they contain and how to cite them; `get` brings one.
 
-No PSF is shipped; `published_psfs.toml` lists them. `get` brings the published file through pooch, or takes it from a folder, checks it
-and keeps its weights as a PSF file of heliopsf (float32), whose header names instrument, version, citation (PSFREF) and DOI (PSFDOI).
-A download must have the checksum of the table, or else the one that the repository tells; it comes from the servers of the table
-alone, and ends at twice the size that its pixels explain. A download that broke off is kept as NAME.CHECKSUM.part, and resumed by the
-next try, even of another process.
+No PSF is shipped; `published_psfs.toml` lists them. `get` brings the published file through pooch, or takes it from a
+folder, checks it and keeps its weights as a PSF file of heliopsf (float32), whose header names instrument, version,
+citation (PSFREF) and DOI (PSFDOI). A download must have the checksum of the table, or else the one that the repository
+tells; it comes from the servers of the table alone, and ends at twice the size that its pixels explain. A download that
+broke off is kept as NAME.CHECKSUM.part, and resumed by the next try, even of another process.
 """
 
 from __future__ import annotations
@@ -46,11 +46,12 @@ _ALGORITHMS = {"MD5": "md5", "SHA-1": "sha1", "SHA-256": "sha256", "SHA-512": "s
 class Published:
     """A published PSF.
 
-    channel: wavelength in angstrom, or the energy. contains: the parts of the PSF. citation, doi: of the publication; doi None: no
-    DOI is known. file: name of the published file, (size_px, size_px) px. addresses: where it is, the next one is asked if one
-    fails; empty: place says where to find it. origins: schemes and hosts of the servers that are asked, also those to which an
-    answer leads. instrument: as cards name it. cards: further cards that images must agree with. file_mib: None if unknown. sha256:
-    of the published file; None: the repository tells a checksum at checksum_address; if that is empty, none is known.
+    channel: wavelength in angstrom, or the energy. contains: the parts of the PSF. citation, doi: of the publication;
+    doi None: no DOI is known. file: name of the published file, (size_px, size_px) px. addresses: where it is, the next
+    one is asked if one fails; empty: place says where to find it. origins: schemes and hosts of the servers that are
+    asked, also those to which an answer leads. instrument: as cards name it. cards: further cards that images must
+    agree with. file_mib: None if unknown. sha256: of the published file; None: the repository tells a checksum at
+    checksum_address; if that is empty, none is known.
     """
 
     name: str
@@ -113,9 +114,10 @@ def get(
 ) -> Path:
     """Bring a published PSF, if ``folder`` does not have it yet; returns its file.
 
-    source: a folder with the published file, for machines without internet; None: download it. A file of a folder is compared with
-    the SHA-256 of the table, if that has one. progress(stage, done, of), in MiB. Raises DataError "unknown-published-psf", "no-address", "psf-not-downloaded", "no-such-file", "published-psf-changed", and the
-    errors of a file that is no PSF; MissingExtra without pooch.
+    source: a folder with the published file, for machines without internet; None: download it. A file of a folder is
+    compared with the SHA-256 of the table, if that has one. progress(stage, done, of), in MiB. Raises DataError
+    "unknown-published-psf", "no-address", "psf-not-downloaded", "no-such-file", "published-psf-changed", and the errors
+    of a file that is no PSF; MissingExtra without pooch.
     """
     one = published(name)
     kept = folder / f"{name}.fits"
@@ -128,7 +130,8 @@ def get(
         if one.sha256 not in (None, sha256):
             raise DataError(
                 "published-psf-changed",
-                f"expected {one.file} with the SHA-256 {one.sha256}; got {sha256}: get the published file again from {one.place}",
+                f"expected {one.file} with the SHA-256 {one.sha256}; got {sha256}: get the published file again from "
+                f"{one.place}",
             )
         from psfcore.fits.psfs import write_kernel  # `psf published` loads no numerical libraries
 
@@ -193,7 +196,9 @@ def _checksum(one: Published) -> str:
 
 
 def _answer(one: Published, address: str, headers: dict[str, str]) -> Response:
-    """The answer to a request, after its redirections. Raises OSError if an address is not at the origins of the PSF."""
+    """The answer to a request, after its redirections. Raises OSError if an address is not at the origins of the
+    PSF.
+    """
     import requests  # pooch needs it
 
     for _ in range(_MOST_REDIRECTIONS + 1):
@@ -242,7 +247,8 @@ def _download(
                 file.truncate(0)
                 if answer.status_code != requests.codes.ok:
                     raise requests.RequestException(
-                        f"expected the whole file or its rest; got status {answer.status_code} and Content-Range {extent}"
+                        f"expected the whole file or its rest; got status {answer.status_code} and Content-Range "
+                        f"{extent}"
                     )
             # The empty block lets the announced size be checked first.
             for block in chain([b""], answer.iter_content(_BLOCK_BYTES)):

@@ -1,7 +1,7 @@
 """The recipe of a PSF that is built from an instrument file, and its identity.
 
-The identity is the SHA-256 of everything that determines the PSF. The service, commands and Python functions use the same
-identity, so they can share a built PSF. This module imports no numerical library.
+The identity is the SHA-256 of everything that determines the PSF. The service, commands and Python functions use the
+same identity, so they can share a built PSF. This module imports no numerical library.
 """
 
 from __future__ import annotations

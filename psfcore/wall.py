@@ -2,16 +2,18 @@
 
 Three parts of Linux make the wall, and none can be taken down again by the process:
 
-- Landlock (Linux 5.13 and later): of all files the process can open those that it may read, and the folders of the libraries' code.
-  Files that are open already stay open.
-- seccomp: the process cannot make sockets, start programs or processes, reach other processes, or change modes and times of files.
-- A user of its own, if the service runs as root. Of the rights of root it keeps the one to read files, because its file and the code of
-  the libraries may be readable for root alone; Landlock says which.
+- Landlock (Linux 5.13 and later): of all files the process can open those that it may read, and the folders of the
+  libraries' code. Files that are open already stay open.
+- seccomp: the process cannot make sockets, start programs or processes, reach other processes, or change modes and
+  times of files.
+- A user of its own, if the service runs as root. Of the rights of root it keeps the one to read files, because its file
+  and the code of the libraries may be readable for root alone; Landlock says which.
 
     raise_wall([path])
     walls()     # {"files": True, "calls": True, "user": True}
 
-Sources: man pages landlock(7), seccomp(2), capabilities(7); include/uapi/linux/landlock.h and the tables of system calls of Linux 6.12.
+Sources: man pages landlock(7), seccomp(2), capabilities(7); include/uapi/linux/landlock.h and the tables of system
+calls of Linux 6.12.
 """
 
 from __future__ import annotations
@@ -38,8 +40,8 @@ _NUMBER_AT, _MACHINE_AT, _ARGUMENT_AT = 0, 4, 16  # in struct seccomp_data
 _ALLOW, _REFUSE, _MISSING = 0x7FFF0000, 0x00050000 | errno.EPERM, 0x00050000 | errno.ENOSYS
 _OTHER_NUMBERS = 0x40000000  # system calls of the x32 interface
 _A_THREAD = 0x10000  # flag of clone
-# For each machine: its number in the audit interface, and the system calls that are refused: sockets, programs, other processes,
-# changes of files that need not be opened, and memory of other processes.
+# For each machine: its number in the audit interface, and the system calls that are refused: sockets, programs, other
+# processes, changes of files that need not be opened, and memory of other processes.
 _MACHINES: dict[str, tuple[int, dict[str, int]]] = {
     "x86_64": (0xC000003E, {
         "shmget": 29, "shmat": 30, "socket": 41, "connect": 42, "accept": 43, "bind": 49, "listen": 50,
@@ -102,7 +104,8 @@ class _Program(ctypes.Structure):
 
 
 def raise_wall(files: Sequence[str | Path]) -> None:
-    """Raise the wall around this process, as far as its kernel has the parts. files: those that it may still open to read.
+    """Raise the wall around this process, as far as its kernel has the parts. files: those that it may still open to
+    read.
 
     Raises OSError if a part exists and cannot be raised, or a file cannot be opened.
     """
@@ -147,7 +150,8 @@ def _close_files(libc: ctypes.CDLL, files: Sequence[str | Path]) -> bool:
 def _leave_root(libc: ctypes.CDLL, files: Sequence[str | Path]) -> bool:
     """Become a user of its own, and say whether this process is root no more.
 
-    It stays root in a container that allows no other user, and if only root can read the files, as on some network file systems.
+    It stays root in a container that allows no other user, and if only root can read the files, as on some network file
+    systems.
     """
     if os.geteuid() != 0:
         return True

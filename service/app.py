@@ -1,4 +1,6 @@
-"""The web application: its routers, its middlewares, and the objects that it makes at its start and keeps until it ends."""
+"""The web application: its routers, its middlewares, and the objects that it makes at its start and keeps until it
+ends.
+"""
 
 from __future__ import annotations
 
@@ -52,15 +54,18 @@ STORED_AT_ONCE = 8  # most of them wait for the store
 
 
 def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
-    """Make the application for these settings. When it starts, it upgrades the tables of the database and starts the reconciler.
+    """Make the application for these settings. When it starts, it upgrades the tables of the database and starts the
+    reconciler.
 
-    bound_to: the address on which it listens. If the settings do not say whether requests need a key, this address decides.
+    bound_to: the address on which it listens. If the settings do not say whether requests need a key, this address
+    decides.
     """
     access, rates = Access.of(settings, bound_to), Rates(settings)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        # Celery is imported only here: the import takes half a second, and writing the OpenAPI description does not need it.
+        # Celery is imported only here: the import takes half a second, and writing the OpenAPI description does not
+        # need it.
         from workers.broker import app as queue
         from workers.broker.reconciler import Reconciler
 
@@ -151,7 +156,8 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
 
 def _correct_description(app: FastAPI) -> None:
     """Correct the OpenAPI description, because the framework describes some answers wrongly: errors are problem
-    documents on every route, and ids in addresses may be shortened."""
+    documents on every route, and ids in addresses may be shortened.
+    """
     generate = app.openapi
 
     def openapi() -> dict[str, Any]:

@@ -1,8 +1,9 @@
-"""The operation of the service: ``/healthz`` (is it up?), ``/readyz`` (can it do its work?) and ``/metrics`` for Prometheus.
+"""The operation of the service: ``/healthz`` (is it up?), ``/readyz`` (can it do its work?) and ``/metrics`` for
+Prometheus.
 
-Numbers about all processes (jobs, files, workers) are read from the database whenever Prometheus reads the
-metrics, by queries that use only indexes. Numbers about this process (its requests) are counted in the process. The numbers
-of jobs and files are gauges, because they decrease when a job is destroyed. The time that jobs spent in their stages is a
+Numbers about all processes (jobs, files, workers) are read from the database whenever Prometheus reads the metrics, by
+queries that use only indexes. Numbers about this process (its requests) are counted in the process. The numbers of jobs
+and files are gauges, because they decrease when a job is destroyed. The time that jobs spent in their stages is a
 counter, which never decreases.
 """
 
@@ -49,7 +50,8 @@ class Readiness(BaseModel):
 
     status: str
     parts: dict[str, str] = Field(
-        description="state of the database, of the storage, of the waiting jobs, and of the broker or embedded worker; `ok`: the "
+        description="state of the database, of the storage, of the waiting jobs, and of the broker or embedded "
+        "worker; `ok`: the "
         "part answers, and workers take the jobs"
     )
 
@@ -69,7 +71,9 @@ async def healthz(request: Request) -> Health:
 
 @router.get("/readyz", summary="Can the service do its work?", responses={503: NOT_READY})
 async def readyz(request: Request) -> Readiness:
-    """200: database, storage, and broker (or embedded worker) answer, and workers take the jobs. 503: one of them does not; `parts` says which one."""
+    """200: database, storage, and broker (or embedded worker) answer, and workers take the jobs. 503: one of them does
+    not; `parts` says which one.
+    """
     parts = await states(state_of(request))
     away = faults(parts)
     if away:
@@ -125,7 +129,8 @@ class _Catalogued(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """The metrics of database, storage and streams. If the database does not answer, its metrics are left out,
-        except ``heliopsf_database_up``, which is 0."""
+        except ``heliopsf_database_up``, which is 0.
+        """
         yield InfoMetricFamily("heliopsf", "The service", {"version": software_version()})
         free = checks.free_bytes(self._state.settings.data_dir)
         yield _gauge("storage_free_bytes", "Free space where files are stored", free)
@@ -194,7 +199,9 @@ class _Catalogued(Collector):
 
 
 def _gauge(name: str, description: str, values: float | Mapping[Any, float], *labels: str) -> Metric:
-    """A gauge. values: its value, or the values by the value of the label, or by a tuple of the values of the labels."""
+    """A gauge. values: its value, or the values by the value of the label, or by a tuple of the values of the
+    labels.
+    """
     by_label = values if isinstance(values, Mapping) else {(): values}
     return _filled(GaugeMetricFamily(f"heliopsf_{name}", description, labels=labels), by_label)
 

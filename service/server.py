@@ -29,7 +29,8 @@ from workers.settings import Settings
 
 log = logging.getLogger(__name__)
 
-# Clients such as httpx reuse an idle connection for up to 5 s. A server that closes it at the same moment resets the request.
+# Clients such as httpx reuse an idle connection for up to 5 s. A server that closes it at the same moment resets the
+# request.
 IDLE_CONNECTION_S = 15
 MOST_OPEN_FILES = 65_536  # each connection and each file that is sent needs one
 
@@ -40,8 +41,8 @@ def serve(
     """Serve until interrupted. Port 0: any free port. ``announce`` is called with the address of the server. verbose:
     also log every request on a terminal.
 
-    On SIGTERM or Control-C the server accepts no more connections. Running requests may continue for ``stop_s`` seconds. Then
-    the server stops the embedded worker, which takes at most ``gone_s`` seconds.
+    On SIGTERM or Control-C the server accepts no more connections. Running requests may continue for ``stop_s``
+    seconds. Then the server stops the embedded worker, which takes at most ``gone_s`` seconds.
     """
     logs.configure(settings, verbose=verbose)
     with listening(host, port) as listener:
@@ -58,7 +59,8 @@ def serve(
                 timeout_graceful_shutdown=ceil(settings.stop_s),
                 http="h11",
                 ws="none",
-                # Without this setting, headers about the address of the client are ignored: a client could write any address.
+                # Without this setting, headers about the address of the client are ignored: a client could write any
+                # address.
                 proxy_headers=bool(settings.proxies),
                 forwarded_allow_ips=list(settings.proxies),
             )
@@ -121,8 +123,8 @@ class _Server(uvicorn.Server):
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Listen, and keep the objects that the start has made."""
         await super().startup(sockets)
-        # All modules are loaded now. Their objects stay, so the garbage collector need not look at them again: this took
-        # up to 0.2 s, in which no request was answered.
+        # All modules are loaded now. Their objects stay, so the garbage collector need not look at them again: this
+        # took up to 0.2 s, in which no request was answered.
         gc.collect()
         gc.freeze()
 

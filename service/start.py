@@ -7,8 +7,8 @@ import time
 from importlib import import_module
 
 STARTED = time.perf_counter()  # when the command began, before the libraries are loaded
-# Libraries make many objects when they are loaded, and hardly any garbage. With Python's own value (700), the collector would
-# look for garbage about a thousand times in the meantime.
+# Libraries make many objects when they are loaded, and hardly any garbage. With Python's own value (700), the collector
+# would look for garbage about a thousand times in the meantime.
 NEW_OBJECTS = 50_000
 
 

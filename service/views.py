@@ -1,4 +1,6 @@
-"""How the service describes jobs, products, PSFs, reports and transits. The command line uses these models too, so they import no web framework."""
+"""How the service describes jobs, products, PSFs, reports and transits. The command line uses these models too, so they
+import no web framework.
+"""
 
 from __future__ import annotations
 
@@ -44,12 +46,15 @@ class Progress(RowView):
     step: int
     steps: int
     time_left_s: float | None = Field(
-        description="estimated time until the last of `steps`, or until the end of a job that counts several times, s; null: "
-        "unknown. The estimate uses the speed since the job began to count these steps, or the estimated time of the job"
+        description="estimated time until the last of `steps`, or until the end of a job that counts several times, "
+        "s; null: "
+        "unknown. The estimate uses the speed since the job began to count these steps, or the estimated time of the "
+        "job"
     )
     share: float | None = Field(
         None,
-        description="share of the estimated time of a job that counts several times, 0 to 1; null: the steps count the whole job, or "
+        description="share of the estimated time of a job that counts several times, 0 to 1; null: the steps count "
+        "the whole job, or "
         "unknown",
     )
 
@@ -74,7 +79,8 @@ class JobView(RowView):
     attempt: int
     cancel_requested: bool
     waiting_before: int | None = Field(
-        description="number of waiting jobs that are expected to start before this job: the jobs of more urgent queues, and "
+        description="number of waiting jobs that are expected to start before this job: the jobs of more urgent "
+        "queues, and "
         "jobs of this queue, in which the owners take turns; 1000: 1000 or more; null: the job is not QUEUED. Only the "
         "answers to a submission and to `GET /v1/jobs/{id}` contain this number; in lists and events it is null"
     )
@@ -83,12 +89,14 @@ class JobView(RowView):
         description="expected time and memory of the job; null: a UWS job that has not been started"
     )
     parameters: dict[str, Any] = Field(
-        description="the parameters, with every default and the PSF filled in; for a PENDING job as the client sent them"
+        description="the parameters, with every default and the PSF filled in; for a PENDING job as the client sent "
+        "them"
     )
     result: str | None = Field(description="address of the result; null until the job is COMPLETED")
     result_deleted: bool = Field(
         False,
-        description="whether the result was deleted; the same request makes the result again. Lists and the answers to a "
+        description="whether the result was deleted; the same request makes the result again. Lists and the answers "
+        "to a "
         "submission and to `GET /v1/jobs/{id}` contain the present value; in events it is always false",
     )
     error: JobError | None
@@ -112,9 +120,9 @@ class JobView(RowView):
 def time_left_s(row: JobRow, now: float | None = None) -> float | None:
     """Estimated remaining time of a running job, s; None if unknown.
 
-    If the steps count the whole job, the estimate uses the speed since the job began to count its present steps. Earlier work, such
-    as reading the images, does not count. Otherwise it is the rest of the estimated time of the job. now: seconds since 1970;
-    default: this machine's clock.
+    If the steps count the whole job, the estimate uses the speed since the job began to count its present steps.
+    Earlier work, such as reading the images, does not count. Otherwise it is the rest of the estimated time of the job.
+    now: seconds since 1970; default: this machine's clock.
     """
     now = time.time() if now is None else now
     if not KINDS[row.kind].counted_whole:
@@ -129,8 +137,9 @@ def time_left_s(row: JobRow, now: float | None = None) -> float | None:
 
 
 def share_of_time(row: JobRow, now: float | None = None) -> float | None:
-    """The share of its estimated time that a running job has used, at most MOST_SHARE; None if its steps count the whole job, or if no
-    estimate is known. now: as for `time_left_s`."""
+    """The share of its estimated time that a running job has used, at most MOST_SHARE; None if its steps count the
+    whole job, or if no estimate is known. now: as for `time_left_s`.
+    """
     if KINDS[row.kind].counted_whole or row.phase != Phase.EXECUTING or row.started_at is None:
         return None
     if not row.estimate or not row.estimate["seconds"]:
@@ -156,7 +165,8 @@ class ProductView(RowView):
     file: str = Field(description="address of the FITS file")
     preview: str = Field(description="address of a picture: the image before and after, and the change")
     thumbnail: str | None = Field(
-        description="address of a small picture of the product; null: the product was made before products had thumbnails"
+        description="address of a small picture of the product; null: the product was made before products had "
+        "thumbnails"
     )
     changes: str | None = Field(
         description="address of a picture of all changes; null: the request did not ask for it"
@@ -181,8 +191,9 @@ class ProductView(RowView):
 
 
 def was_certified(row: PsfRow) -> bool:
-    """Whether a PSF is or was certified. An interpolated PSF may be deprecated together with one of its ends, without having
-    been certified."""
+    """Whether a PSF is or was certified. An interpolated PSF may be deprecated together with one of its ends, without
+    having been certified.
+    """
     return row.status == PsfStatus.CERTIFIED or row.valid_from is not None
 
 
@@ -252,7 +263,8 @@ class ReportView(RowView):
         description="address of the report as a self-contained HTML page; null: the report has none"
     )
     output: str | None = Field(
-        description="address of the FITS file that the rerun made; no list contains this file; null: the report is not on a rerun"
+        description="address of the FITS file that the rerun made; no list contains this file; null: the report is "
+        "not on a rerun"
     )
 
     @classmethod

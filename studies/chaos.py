@@ -294,7 +294,8 @@ def patiently(client: httpx.Client, path: str, **options: object) -> str:
 
 
 def send(running: Servers, folder: Path, jobs: int, px: int) -> dict[str, str]:
-    """Upload `jobs` different images and request a deconvolution of each. Returns the id of the job by id of the image."""
+    """Upload `jobs` different images and request a deconvolution of each. Returns the id of the job by id of the
+    image."""
     sent: dict[str, str] = {}
     path, method = folder / "sent.fits", {"name": "richardson-lucy", "steps": STEPS}
     with httpx.Client(base_url=running.address, timeout=30) as client:

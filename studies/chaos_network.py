@@ -1,12 +1,13 @@
 """Cut the network of workers whose clocks differ, and kill processes: no job may be lost, done twice, or stuck.
 
-    python -m studies.chaos_network [--jobs 300] [--faults 30] [--cuts 2] [--cut-s 60] [--apart-s 90] [--px 64] [--seed 1]
+    python -m studies.chaos_network [--jobs 300] [--faults 30] [--cuts 2] [--cut-s 60] [--apart-s 90] [--px 64] [--seed
+    1]
 
 The study simulates three hosts with Linux network namespaces. On the first run PostgreSQL, Redis, an S3 server (moto)
 and the service; on each of the others runs a worker. The workers reach the first host through a bridge, have their own
 host names and data folders, and keep files only in S3. The clocks of the workers are APART seconds apart, around the
-clock of the first host. A fault is one of two kinds: a cut takes a worker out of the bridge for CUT seconds,
-so that its packets vanish without an answer; a kill sends SIGKILL to a process group, which starts again a moment later.
+clock of the first host. A fault is one of two kinds: a cut takes a worker out of the bridge for CUT seconds, so that
+its packets vanish without an answer; a kill sends SIGKILL to a process group, which starts again a moment later.
 
 The study needs Linux, root, the commands `ip` and `unshare` (Debian: iproute2, util-linux), a C compiler, PostgreSQL,
 Redis, and the packages of the extra `dev`. All its traffic stays in its namespaces, which it removes at the end.

@@ -1,8 +1,9 @@
 """Calibrate the level of the answer of a gap diagnosis, with simulated cases of known cause.
 
-The cases have effects of the library, written by another author, and withheld effects of the calibration; those of the tests are never
-used. Each case is diagnosed from its images alone. From its report follows the smallest level at which the alternatives contain a true
-cause (`psfcore.gap.verdict.calibration`, Eq. (1)). Cases in which no gap is detected do not count.
+The cases have effects of the library, written by another author, and withheld effects of the calibration; those of the
+tests are never used. Each case is diagnosed from its images alone. From its report follows the smallest level at which
+the alternatives contain a true cause (`psfcore.gap.verdict.calibration`, Eq. (1)). Cases in which no gap is detected do
+not count.
 
     python -m studies.gap_calibration -o DIR --cases 64 --seed 502 --write
 
@@ -33,7 +34,8 @@ from service.cli.transits import DIAGNOSE
 TRIED = (*np.linspace(0.3, 0.99, 70), 0.995)
 MISSED = 1.0  # the level of a case whose true cause is in no group
 HOLDS_FOR = (
-    "They are like these: 18 images of 256 px in three pointings, with one or two effects of the library, or with an effect "
+    "They are like these: 18 images of 256 px in three pointings, with one or two effects of the library, or with an "
+    "effect "
     "that is not in the library, whose gap is detected. The author of the simulated effects did not use the library."
 )
 

@@ -169,7 +169,8 @@ def copy_checkout(copy: Path) -> None:
 
 
 def run_tests(copy: Path, tests: str, limit_s: float) -> tuple[str, str]:
-    """Run tests in the copy until one fails. Returns the state, and the first failing test or the reason of an error."""
+    """Run tests in the copy until one fails. Returns the state, and the first failing test or the reason of an
+    error."""
     environment = os.environ | {
         "PYTHONPATH": str(copy)
     }  # Python imports the copy before the installed checkout

@@ -1,7 +1,7 @@
 """Figures of the right size without content: to draw a figure takes half a second, and a report has a dozen.
 
-Tests of the service and of its jobs use them. The tests in tests/psfcore draw each figure, and the processes that the tests in
-tests/whole start draw those of real jobs.
+Tests of the service and of its jobs use them. The tests in tests/psfcore draw each figure, and the processes that the
+tests in tests/whole start draw those of real jobs.
 """
 
 from __future__ import annotations

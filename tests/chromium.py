@@ -1,4 +1,5 @@
-"""The browser of the tests of pages. Where it is missing, none of these tests is collected, and the run says so in one line."""
+"""The browser of the tests of pages. Where it is missing, none of these tests is collected, and the run says so in one
+line."""
 
 from __future__ import annotations
 
@@ -23,6 +24,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
     paths = [Path(argument.split("::")[0]).resolve() for argument in config.args]
     if chromium() is None and any(TESTS.is_relative_to(path) or path.is_relative_to(TESTS) for path in paths):
         terminalreporter.write_line(
-            f"not run: {TESTS.relative_to(config.rootpath)}: no Chromium on this machine: install it, or name one in {VARIABLE}",
+            f"not run: {TESTS.relative_to(config.rootpath)}: no Chromium on this machine: install it, or name one in "
+            f"{VARIABLE}",
             yellow=True,
         )

@@ -53,7 +53,8 @@ def fitted_psf(
 
 @contextmanager
 def interpolated_on_a_small_grid() -> Iterator[None]:
-    """Compute PSFs between two fits on 512 px instead of 2048 px: those of `fitted_psf` are the same, their curves end earlier."""
+    """Compute PSFs between two fits on 512 px instead of 2048 px: those of `fitted_psf` are the same, their curves end
+    earlier."""
     with patch.object(interpolation, "REACH_GRID_PX", GRID_PX):
         yield
 

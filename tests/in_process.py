@@ -1,4 +1,5 @@
-"""The jobs of a service in the process of a test: it accepts the same requests and runs the same tasks, without HTTP."""
+"""The jobs of a service in the process of a test: it accepts the same requests and runs the same tasks, without
+HTTP."""
 
 from __future__ import annotations
 

@@ -15,7 +15,8 @@ T = TypeVar("T")
 
 
 def once_a_run(make: Callable[[], T], name: str, folders: pytest.TempPathFactory) -> T:
-    """The value that ``make`` returns. It is made by the first worker that asks; the others wait and read it from a file.
+    """The value that ``make`` returns. It is made by the first worker that asks; the others wait and read it from a
+    file.
 
     name: of the file, below the temporary folder of this run. Without xdist, the value is made and returned.
     """

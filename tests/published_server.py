@@ -32,8 +32,9 @@ def published_fits(size: int = 96, *, total: float = 1.0) -> bytes:
 
 @dataclass
 class StandIn:
-    """The server's files by path. published: the file whose MD5 it tells. broken: how many of the next answers end too early. faults: by
-    path, what answers instead. asked: the paths of all requests for files. sent: how many bytes each answer announced."""
+    """The server's files by path. published: the file whose MD5 it tells. broken: how many of the next answers end too
+    early. faults: by path, what answers instead. asked: the paths of all requests for files. sent: how many bytes each
+    answer announced."""
 
     files: dict[str, bytes]
     published: bytes

@@ -1,7 +1,7 @@
 """The routes of the service, prepared once for all applications of a process.
 
-FastAPI prepares the routes of a router, with their models, when an application matches its first request: a tenth to half a
-second for each of a thousand applications that tests make. The routers are the same modules each time.
+FastAPI prepares the routes of a router, with their models, when an application matches its first request: a tenth to
+half a second for each of a thousand applications that tests make. The routers are the same modules each time.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ INCLUDE = FastAPI.include_router
 
 @contextmanager
 def shared_routes() -> Iterator[None]:
-    """While this context is active, an application takes over the routes that an earlier one made of the same router."""
+    """While this context is active, an application takes over the routes that an earlier one made of the same
+    router."""
     made: dict[int, tuple[APIRouter, list[BaseRoute]]] = {}
 
     def include(app: FastAPI, router: APIRouter) -> None:

@@ -1,8 +1,8 @@
 """Two services for the whole run of the tests, shared by all its processes: one that is open, one that asks for keys.
 
-The first process that asks for a service starts it, in a session of its own; the process that began the run stops it at the
-end, also when the run is interrupted. Tests bring names or owners of their own, look only at their own rows, and kill, fill
-and change nothing; those that do start a stack of their own (``tests.whole.stack``).
+The first process that asks for a service starts it, in a session of its own; the process that began the run stops it at
+the end, also when the run is interrupted. Tests bring names or owners of their own, look only at their own rows, and
+kill, fill and change nothing; those that do start a stack of their own (``tests.whole.stack``).
 """
 
 from __future__ import annotations
@@ -104,7 +104,8 @@ def _stack(name: str) -> Stack:
 def _lay_traps(folder: Path) -> None:
     """Put modules into a working folder that tell by the file "sprung" that they were imported.
 
-    They have the names of modules that a server or a worker imports only after its start, or that another program may have left.
+    They have the names of modules that a server or a worker imports only after its start, or that another program may
+    have left.
     """
     folder.mkdir()
     names = {

@@ -1,4 +1,5 @@
-"""Checks the database, storage and broker on which the service depends. Each check raises ``Unusable`` with a short sentence.
+"""Checks the database, storage and broker on which the service depends. Each check raises ``Unusable`` with a short
+sentence.
 
 The sentences contain no address and no credentials, so they can be shown to anybody.
 """
@@ -34,7 +35,8 @@ CHECK_S = 5.0  # time after which something that has not answered counts as away
 PAGES_S = CHECK_S / 2  # longest time that a check waits for the pages of a database
 _pages: WeakKeyDictionary[Catalogue, _Pages] = WeakKeyDictionary()
 PAGES_SHARE = 0.01  # largest share of the time that is spent on checking the pages
-# While workers do nothing, a waiting job is sent to them every ``resubmit_s``. They count as deaf after this number of times.
+# While workers do nothing, a waiting job is sent to them every ``resubmit_s``. They count as deaf after this number of
+# times.
 RESUBMISSIONS = 4
 
 
@@ -257,5 +259,6 @@ def _refusal(error: Exception) -> str:
 
 def _kind(error: BaseException) -> str:
     """The name of the error's class; if the error has a cause, the name of the cause's class, which is more
-    specific."""
+    specific.
+    """
     return type(getattr(error, "orig", None) or error.__cause__ or error).__name__

@@ -64,22 +64,26 @@ class Creation(BaseModel):
 
 class Ancestor(BaseModel):
     """A product, PSF, report, image, transit or instrument file, and its parents: the entries from which it was
-    made."""
+    made.
+    """
 
     type: Type
     id: str = Field(description="id; for an upload or an instrument file the SHA-256 of its bytes")
     there: bool = Field(
-        description="whether the catalogue still contains the thing; false for an instrument file, because its text is in the PSF file"
+        description="whether the catalogue still contains the thing; false for an instrument file, because its text "
+        "is in the PSF file"
     )
     made: Creation | None = Field(None, description="null for an upload and for a deleted thing")
     weight: float | None = Field(
         None,
-        description="the weight of this PSF in the PSF that was interpolated between it and another PSF; null for other parents",
+        description="the weight of this PSF in the PSF that was interpolated between it and another PSF; null for "
+        "other parents",
     )
     parents: list[Ancestor] = []
     cut: bool = Field(
         False,
-        description="true: the parents are left out here, because they are listed elsewhere in this answer or because there are too many things",
+        description="true: the parents are left out here, because they are listed elsewhere in this answer or because "
+        "there are too many things",
     )
 
 
@@ -98,12 +102,14 @@ def made_by(catalogue: Catalogue, row: ProductRow | PsfRow) -> ResolvedRerun:
     if isinstance(row, PsfRow) and row.origin == "uploaded":
         raise DataError(
             "not-made-here",
-            f"expected a PSF that this service made; PSF {row.id} was uploaded, so no job made it: choose a built or fitted PSF",
+            f"expected a PSF that this service made; PSF {row.id} was uploaded, so no job made it: choose a built or "
+            "fitted PSF",
         )
     if parameters is None:
         raise DataError(
             "parameters-unknown",
-            f"expected the parameters that {row.id} was made with; these parameters were not recorded: submit a new request "
+            f"expected the parameters that {row.id} was made with; these parameters were not recorded: submit a new "
+            "request "
             "instead",
         )
     try:
@@ -118,7 +124,9 @@ def made_by(catalogue: Catalogue, row: ProductRow | PsfRow) -> ResolvedRerun:
 
 
 def _job_of(row: ProductRow | PsfRow, parameters: dict[str, Any]) -> ResolvedRerun:
-    """The job with these parameters. The catalogue may contain only the parameters that the client gave; this function adds the defaults."""
+    """The job with these parameters. The catalogue may contain only the parameters that the client gave; this function
+    adds the defaults.
+    """
     of: Literal["product", "psf"] = "product" if isinstance(row, ProductRow) else "psf"
     origin = _origin(row)
     kind = kind_of_origin(origin)
@@ -154,7 +162,8 @@ _TABLES: dict[Type, Any] = {"psf": PsfRow, "image": ImageRow, "transit": Transit
 
 class _Walk:
     """One walk through a lineage. If an entry occurs twice, it is listed twice, but its parents are listed only
-    once."""
+    once.
+    """
 
     def __init__(self, catalogue: Catalogue, owner: str) -> None:
         self._catalogue, self._owner = catalogue, owner

@@ -35,7 +35,8 @@ _REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
 
 def bind(**about: str) -> None:
     """Add ``request``, ``job`` or ``owner`` to all later log lines of this thread or asynchronous task
-    (`contextvars`)."""
+    (`contextvars`).
+    """
     _ABOUT.set({**_ABOUT.get(), **about})
 
 
@@ -101,7 +102,9 @@ def _one_line(text: str) -> str:
 
 
 class RotatedFile(RotatingFileHandler):
-    """A log file that several processes share. When it is full, it is renamed to FILE.1, FILE.1 to FILE.2, and so on."""
+    """A log file that several processes share. When it is full, it is renamed to FILE.1, FILE.1 to FILE.2, and so
+    on.
+    """
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write the record, while no other process rotates the file."""
@@ -115,14 +118,17 @@ class RotatedFile(RotatingFileHandler):
 
 
 def _tried_again(record: logging.LogRecord) -> bool:
-    """Lower errors of Celery to warnings: a lost broker or a lost process is no failure of a job, which is tried again."""
+    """Lower errors of Celery to warnings: a lost broker or a lost process is no failure of a job, which is tried
+    again.
+    """
     if record.levelno >= logging.ERROR:
         record.levelno, record.levelname = logging.WARNING, logging.getLevelName(logging.WARNING)
     return True
 
 
 class Seldom(logging.Filter):
-    """Writes at most one record of each kind in ``every_s`` seconds. The next record says how many records were left out.
+    """Writes at most one record of each kind in ``every_s`` seconds. The next record says how many records were left
+    out.
 
     Two records are of the same kind if they come from the same logger and the first lines of their message templates
     are equal. The filter is for messages that clients without a key can cause; without it, these messages could fill
@@ -162,7 +168,8 @@ _SELDOM_ACCEPTS = Seldom(lambda record: record.getMessage().startswith("socket.a
 
 def _no_request(record: logging.LogRecord) -> bool:
     """False if the record is about a request that was answered without a failure of the service (status below 500);
-    otherwise True."""
+    otherwise True.
+    """
     return record.name != REQUESTS or getattr(record, "fields", {}).get("status", 500) >= 500
 
 

@@ -110,7 +110,8 @@ def _text(file: Path) -> str:
 
 
 def psf_cache() -> PsfCache:
-    """The cache in the folder that HELIOPSF_CACHE_DIR names, or in the user's cache folder, such as ``~/.cache/heliopsf``.
+    """The cache in the folder that HELIOPSF_CACHE_DIR names, or in the user's cache folder, such as
+    ``~/.cache/heliopsf``.
 
     Raises DataError "bad-setting" if HELIOPSF_CACHE_MIB is not a whole number.
     """

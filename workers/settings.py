@@ -34,7 +34,8 @@ class Settings(BaseSettings):
 
     data_dir: Path = Field(
         default_factory=lambda: user_data_path("heliopsf", appauthor=False),
-        description="folder of stored files and, by default, of the SQLite database; default: the user's data folder, on Linux "
+        description="folder of stored files and, by default, of the SQLite database; default: the user's data folder, "
+        "on Linux "
         "`~/.local/share/heliopsf`",
     )
     store_url: str | None = Field(
@@ -48,13 +49,15 @@ class Settings(BaseSettings):
     quota_mib: int = Field(
         0,
         ge=0,
-        description="largest size of an owner's stored files, MiB; 0: unlimited; `heliopsf store quota` sets another limit for an "
+        description="largest size of an owner's stored files, MiB; 0: unlimited; `heliopsf store quota` sets another "
+        "limit for an "
         "owner",
     )
     keep_days: str = Field(
         "",
         pattern=rf"^$|^({_KEPT})(, *{_KEPT})*$",
-        description="for how many days things are kept, by kind and owner, for example `product=365,image=90,ann/product=30`; "
+        description="for how many days things are kept, by kind and owner, for example "
+        "`product=365,image=90,ann/product=30`; "
         f"older ones are deleted once an hour; kinds: {', '.join(KEPT_KINDS)}; default: everything is kept",
     )
     keep_dry_run: bool = Field(
@@ -63,7 +66,8 @@ class Settings(BaseSettings):
     min_free_mib: int = Field(
         256,
         ge=0,
-        description="minimum free space on the disk that contains data_dir, MiB; if less is free, uploads and jobs are refused, and /readyz answers 503",
+        description="minimum free space on the disk that contains data_dir, MiB; if less is free, uploads and jobs "
+        "are refused, and /readyz answers 503",
     )
     database_url: str | None = Field(
         None, description="SQLAlchemy URL of the database; default: SQLite in data_dir"
@@ -94,7 +98,8 @@ class Settings(BaseSettings):
     )
     worker_queues: str = Field(
         ",".join(Queue),
-        description="queues that a worker serves, separated by commas; the order in this list does not change their priority",
+        description="queues that a worker serves, separated by commas; the order in this list does not change their "
+        "priority",
     )
     psf_cache_mib: int = Field(
         1024, ge=0, description="memory of a worker process for prepared PSFs, which later jobs reuse, MiB"
@@ -116,18 +121,21 @@ class Settings(BaseSettings):
     cancel_s: float = Field(
         10.0,
         gt=0,
-        description="if a job was cancelled or took too long but does not stop, its worker process is ended and replaced after this time, s",
+        description="if a job was cancelled or took too long but does not stop, its worker process is ended and "
+        "replaced after this time, s",
     )
     max_attempts: int = Field(3, ge=1, description="number of attempts after which a job fails")
     stop_s: float = Field(
         15.0,
         ge=0,
-        description="time after SIGTERM in which running requests and jobs may finish, s; then unfinished jobs are queued again",
+        description="time after SIGTERM in which running requests and jobs may finish, s; then unfinished jobs are "
+        "queued again",
     )
     traces_url: str | None = Field(
         None,
         pattern=r"^https?://\S+$",
-        description="address to which traces are sent by OTLP over HTTP, such as http://127.0.0.1:4318/v1/traces (needs the extra "
+        description="address to which traces are sent by OTLP over HTTP, such as http://127.0.0.1:4318/v1/traces "
+        "(needs the extra "
         "`traces`); default: no traces",
     )
     log_format: Literal["text", "json"] | None = Field(
@@ -162,7 +170,8 @@ class Settings(BaseSettings):
 
     access: Literal["open", "keys"] | None = Field(
         None,
-        description="who may use the service: `open`: everybody; `keys`: clients with a key; default: `open` on a loopback address, otherwise `keys`",
+        description="who may use the service: `open`: everybody; `keys`: clients with a key; default: `open` on a "
+        "loopback address, otherwise `keys`",
     )
     session_days: float = Field(
         30.0,
@@ -176,7 +185,8 @@ class Settings(BaseSettings):
     )
     trusted_proxies: str = Field(
         "",
-        description="addresses or networks of reverse proxies, separated by commas; the service believes their headers X-Forwarded-For and X-Forwarded-Proto",
+        description="addresses or networks of reverse proxies, separated by commas; the service believes their "
+        "headers X-Forwarded-For and X-Forwarded-Proto",
     )
     max_body_kib: int = Field(
         256, ge=16, le=1_048_576, description="largest request that is neither an upload nor a bulk run, KiB"
@@ -185,7 +195,8 @@ class Settings(BaseSettings):
     reads_per_minute: int = Field(
         12_000,
         ge=0,
-        description="largest number of read requests of one owner (without keys: of one address) per minute; 0: unlimited",
+        description="largest number of read requests of one owner (without keys: of one address) per minute; 0: "
+        "unlimited",
     )
     submissions_per_minute: int = Field(
         3_000,
@@ -211,17 +222,20 @@ class Settings(BaseSettings):
     max_job_memory_mib: int = Field(
         default_factory=lambda checked: _memory_of_a_job_mib(checked.get("worker_processes", 1)),
         ge=1,
-        description="largest estimated memory of a job, MiB; a job that needs more is refused; default: 80 % of the memory of the machine (or of its container) / worker_processes",
+        description="largest estimated memory of a job, MiB; a job that needs more is refused; default: 80 % of the "
+        "memory of the machine (or of its container) / worker_processes",
     )
     max_job_s: float = Field(
         172_800.0,
         gt=0,
-        description="longest time of a job, s; a job with a longer estimate is refused, and an attempt that takes longer is stopped",
+        description="longest time of a job, s; a job with a longer estimate is refused, and an attempt that takes "
+        "longer is stopped",
     )
 
     gap_effects: str = Field(
         "",
-        description="modules or .py files, separated by commas, that define further effects for gap diagnoses; their code is executed",
+        description="modules or .py files, separated by commas, that define further effects for gap diagnoses; their "
+        "code is executed",
     )
 
     @field_validator("worker_queues")
@@ -245,7 +259,8 @@ class Settings(BaseSettings):
     @classmethod
     def apart(cls, data_dir: Path, *, gap_effects: str = "") -> Settings:
         """Default settings with this data folder. These settings ignore the environment, so that the process cannot
-        touch a running service."""
+        touch a running service.
+        """
         return cls(_env_prefix="HELIOPSF_APART_", data_dir=data_dir, gap_effects=gap_effects)
 
     @property
@@ -289,15 +304,17 @@ class Settings(BaseSettings):
 
     @property
     def threads(self) -> int:
-        """Threads of one worker process; default: cores divided by worker processes, so that the processes share the machine."""
+        """Threads of one worker process; default: cores divided by worker processes, so that the processes share the
+        machine.
+        """
         return self.worker_threads or max(1, cores() // self.worker_processes)
 
     @property
     def gone_s(self) -> float:
         """Longest time from SIGTERM to the exit of a worker, even if its job is not finished, s.
 
-        It is longer than ``stop_s``: a worker checks only at each heartbeat whether it must hand back its job, and then Celery
-        needs a few seconds to end.
+        It is longer than ``stop_s``: a worker checks only at each heartbeat whether it must hand back its job, and then
+        Celery needs a few seconds to end.
         """
         return self.stop_s + self.heartbeat_s + 6.0
 

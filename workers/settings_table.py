@@ -38,7 +38,8 @@ Commands with `--local` and the Python functions keep built PSFs in a cache, whi
 
 | variable | meaning |
 |---|---|
-| `HELIOPSF_CACHE_DIR` | Folder of the cache; default: the user's cache folder, on Linux `~/.cache/heliopsf`. Compiled kernels are kept in it, if numba finds no other folder for them (`NUMBA_CACHE_DIR`). |
+| `HELIOPSF_CACHE_DIR` | Folder of the cache; default: the user's cache folder, on Linux `~/.cache/heliopsf`. \
+Compiled kernels are kept in it, if numba finds no other folder for them (`NUMBA_CACHE_DIR`). |
 | `HELIOPSF_CACHE_MIB` | Largest size of the cache, MiB; default: 2048; 0: PSFs are not kept. |
 """
 

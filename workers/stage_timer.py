@@ -2,8 +2,8 @@
 
 A report of step n > 0 means that the job has worked on this stage since the previous report: the time between the two
 reports counts for this stage. A report of step 0 means that a stage begins: the time since the previous report counts
-for the previous stage. The time that reporting itself takes, such as writing the progress to the database, counts for no
-stage.
+for the previous stage. The time that reporting itself takes, such as writing the progress to the database, counts for
+no stage.
 """
 
 from __future__ import annotations

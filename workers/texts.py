@@ -1,7 +1,8 @@
 """Texts that people choose for others to read: names, labels, reasons, names of files.
 
 A mark that reverses the direction of writing, or a control character, makes a text look like another one. So what
-``str.isprintable`` does not accept is refused, and dropped from names that no person typed, as those of files and headers.
+``str.isprintable`` does not accept is refused, and dropped from names that no person typed, as those of files and
+headers.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Traces of requests and jobs by OpenTelemetry, if the setting ``traces_url`` names a collector.
 
-Without the setting, heliopsf imports nothing of OpenTelemetry, and a span costs one comparison. The trace of a job has the
-job's id as its trace id, so the attempts of a job on several workers belong to one trace, which anybody finds who knows
-the job.
+Without the setting, heliopsf imports nothing of OpenTelemetry, and a span costs one comparison. The trace of a job has
+the job's id as its trace id, so the attempts of a job on several workers belong to one trace, which anybody finds who
+knows the job.
 """
 
 from __future__ import annotations

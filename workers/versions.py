@@ -1,4 +1,5 @@
-"""Versions of PSFs: their series and variants, their status and version numbers, and the times for which they are valid.
+"""Versions of PSFs: their series and variants, their status and version numbers, and the times for which they are
+valid.
 
 This module does not use the database. The status of a PSF changes in this way:
 
@@ -101,7 +102,8 @@ def variant_for(cards: Mapping[str, Any], channels: Iterable[str]) -> str | None
     if len(best) > 1:
         raise DataError(
             "several-variants-fit",
-            f"expected one variant of the channel that agrees with the filter and plate scale of the image; got {', '.join(best)}: "
+            "expected one variant of the channel that agrees with the filter and plate scale of the image; got "
+            f"{', '.join(best)}: "
             "name the PSF in the request, or certify a PSF for a variant with both properties",
         )
     return best[0] if best else None

@@ -1,11 +1,12 @@
-"""The PSFs of the seven channels of AIA beside those of aiapy, and an image deconvolved by both: the tables of docs/aia.md.
+"""The PSFs of the seven channels of AIA beside those of aiapy, and an image deconvolved by both: the tables of
+docs/aia.md.
 
     python -m benchmarks.race.aia IMAGE PAGE
 
-aiapy runs in a process and an environment of its own. A PSF of aiapy has 4096 x 4096 px and takes minutes to an hour to compute,
-because aiapy adds every order to the whole array. Therefore this module evaluates aiapy's published equations only near each
-order, with aiapy's numbers (`filter_mesh_parameters`). For three orders aiapy itself is fast enough, and the process checks that
-both results agree.
+aiapy runs in a process and an environment of its own. A PSF of aiapy has 4096 x 4096 px and takes minutes to an hour to
+compute, because aiapy adds every order to the whole array. Therefore this module evaluates aiapy's published equations
+only near each order, with aiapy's numbers (`filter_mesh_parameters`). For three orders aiapy itself is fast enough, and
+the process checks that both results agree.
 
     I(x) = sum over arms and orders m of sinc^2(m w / d) exp(-k |x - m s|^2),   k = 4.5 / px^2
 
@@ -203,7 +204,8 @@ def marked(value: float, what: str, form: str) -> str:
 def geometry_table(peer: dict[int, Any], own: dict[int, Any]) -> list[str]:
     """The angles and spacings of the arms of each channel."""
     lines = [
-        "| channel | arms, heliopsf | arms, aiapy | largest deviation | spacing, heliopsf | spacing, aiapy | largest deviation |",
+        "| channel | arms, heliopsf | arms, aiapy | largest deviation | spacing, heliopsf | spacing, aiapy | largest "
+        "deviation |",
         "|---|---|---|---|---|---|---|",
     ]
     for channel in CHANNELS:
@@ -294,7 +296,10 @@ def main() -> None:
         python = python_of(CONTENDERS["aiapy"].requirement)
         found = answer_of("benchmarks.race.aia", *words, python=python, PYTHONPATH=str(REPOSITORY))
         peer = {int(channel): values for channel, values in found["channels"].items()}
-        checked = f"aiapy {found['version']}; the sum of all absolute deviations is {found['deviation']:.0e} of the light."
+        checked = (
+            f"aiapy {found['version']}; the sum of all absolute deviations is {found['deviation']:.0e} of the "
+            "light."
+        )
         for part, lines in (
             ("arms", [checked, "", *geometry_table(peer, own)]),
             ("light", light_table(peer, own)),

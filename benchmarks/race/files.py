@@ -2,10 +2,10 @@
 
     python -m benchmarks.race.files [NAME ...] [--whole] [--rounds N] [--page FILE]
 
-The image, the PSF and the environments are those of `benchmarks.race.peers`. A script reads both files with astropy, runs the loop of
-the package, and writes the result with astropy; heliopsf also checks the PSF, measures the changes and writes QUALITY. The results are
-compared. A time is that of the process, with its start and its imports; each process runs once before, so that kernels and compiled
-modules are kept.
+The image, the PSF and the environments are those of `benchmarks.race.peers`. A script reads both files with astropy,
+runs the loop of the package, and writes the result with astropy; heliopsf also checks the PSF, measures the changes and
+writes QUALITY. The results are compared. A time is that of the process, with its start and its imports; each process
+runs once before, so that kernels and compiled modules are kept.
 """
 
 from __future__ import annotations

@@ -2,16 +2,17 @@
 
     python -m benchmarks.race.peers [NAME ...] [--whole] [--rounds N] [--page FILE]
 
-All packages run in turn, each in a process and an environment of its own: `.venv-peers/NAME`, made if it is missing, with the
-numpy, scipy and astropy of constraints.txt. HELIOPSF_PEERS_PYTHON names another Python for them, which new packages may need. A time
-contains everything from the image in memory to the result in memory; each loop first runs for one step, so that compiling and planning
-are left out. The results are compared before a time is printed.
+All packages run in turn, each in a process and an environment of its own: `.venv-peers/NAME`, made if it is missing,
+with the numpy, scipy and astropy of constraints.txt. HELIOPSF_PEERS_PYTHON names another Python for them, which new
+packages may need. A time contains everything from the image in memory to the result in memory; each loop first runs for
+one step, so that compiling and planning are left out. The results are compared before a time is printed.
 
-By default the image has 2048 px and the PSF 4096 px, so that every package convolves linearly: zeros surround the image. Packages
-with a deconvolution run their own: heliopsf, scikit-image and aiapy. For the others, which have FFTs but no deconvolution, the
-loop is the simplest one with their FFTs, in single precision with all threads. --whole: an image of the whole Sun of 4096 px with
-a PSF of this size, for heliopsf and for the loop of aiapy in NumPy and in JAX. aiapy then continues the image periodically, so that
-light scattered beyond an edge comes back at the opposite one; the inner 1600 px, where this light hardly matters, are compared.
+By default the image has 2048 px and the PSF 4096 px, so that every package convolves linearly: zeros surround the
+image. Packages with a deconvolution run their own: heliopsf, scikit-image and aiapy. For the others, which have FFTs
+but no deconvolution, the loop is the simplest one with their FFTs, in single precision with all threads. --whole: an
+image of the whole Sun of 4096 px with a PSF of this size, for heliopsf and for the loop of aiapy in NumPy and in JAX.
+aiapy then continues the image periodically, so that light scattered beyond an edge comes back at the opposite one; the
+inner 1600 px, where this light hardly matters, are compared.
 """
 
 from __future__ import annotations
@@ -38,7 +39,10 @@ REPOSITORY = Path(__file__).parents[2]
 STEPS, ROUNDS = 20, 5
 FLOOR_OF_MAXIMUM = 2.0**-23
 FLAT = 0.5  # of the brightest pixel: the start of scikit-image
-HEAD = "| package | time (s) | time (F) | time / time of heliopsf (range) | peak memory (GiB) | deviation |\n|---|---|---|---|---|---|"
+HEAD = (
+    "| package | time (s) | time (F) | time / time of heliopsf (range) | peak memory (GiB) | deviation "
+    "|\n|---|---|---|---|---|---|"
+)
 
 Array = Any
 Loop = Callable[[np.ndarray, np.ndarray, int], np.ndarray]
@@ -83,8 +87,8 @@ def plain_steps(
     padded: Array, transfer: Array, steps: int, forward: Callable[[Array], Array], inverse: Callable[[Array], Array],
     at_least: Callable[[Array, float], Array] = np.maximum, start: Array = None,
 ) -> Array:  # fmt: skip
-    """The steps with any FFT. padded: the image on the plane of the PSF. at_least(a, b): the larger of both, by element.
-    start: the first estimate; None: the image."""
+    """The steps with any FFT. padded: the image on the plane of the PSF. at_least(a, b): the larger of both, by
+    element. start: the first estimate; None: the image."""
     estimate, floor = padded if start is None else start, float(padded.max()) * FLOOR_OF_MAXIMUM
     for _ in range(steps):
         ratio = padded / at_least(inverse(forward(estimate) * transfer), floor)
@@ -226,8 +230,8 @@ def aia_map(pixels: np.ndarray) -> Any:
 @dataclass(frozen=True)
 class Contender:
     """A package of the race. requirement: what pip installs into its environment; empty: the environment of heliopsf.
-    flat_start: it begins with the same value in all pixels, so it is compared with SciPy's loop from this start. double: in
-    double precision."""
+    flat_start: it begins with the same value in all pixels, so it is compared with SciPy's loop from this start.
+    double: in double precision."""
 
     loop: Loop
     requirement: str = ""
@@ -256,8 +260,8 @@ WHOLE = {
 
 @dataclass(frozen=True)
 class Race:
-    """The sizes of image and PSF, px; the contenders; the pixels that are compared; the largest deviation allowed, of the
-    brightest pixel, from heliopsf: single precision, and for the whole Sun the light across the edges."""
+    """The sizes of image and PSF, px; the contenders; the pixels that are compared; the largest deviation allowed, of
+    the brightest pixel, from heliopsf: single precision, and for the whole Sun the light across the edges."""
 
     image_px: int
     psf_px: int
@@ -318,7 +322,8 @@ def one_run(race: Race, name: str, words: Sequence[str], folder: Path, f_s: floa
 
 
 def deviation(race: Race, name: str, result: np.ndarray, folder: Path) -> float:
-    """The deviation of a result from that of heliopsf, which runs first. Raises SystemExit if it is larger than the race allows."""
+    """The deviation of a result from that of heliopsf, which runs first. Raises SystemExit if it is larger than the
+    race allows."""
     if name == "heliopsf":
         np.save(folder / "heliopsf.npy", result)
     expected = np.load(folder / ("flat.npy" if race.contenders[name].flat_start else "heliopsf.npy"))
@@ -332,7 +337,8 @@ def deviation(race: Race, name: str, result: np.ndarray, folder: Path) -> float:
 
 
 def prepare(race: Race, folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """The image and the PSF of a race; they are also written to the folder, with the result of SciPy's loop from a flat start."""
+    """The image and the PSF of a race; they are also written to the folder, with the result of SciPy's loop from a flat
+    start."""
     image, psf = race.data()
     flat = scipy_fft(image, psf, STEPS, np.full_like(image, FLAT * image.max()))
     for label, array in (("image", image), ("psf", psf), ("flat", flat[: len(image), : len(image)])):

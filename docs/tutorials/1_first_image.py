@@ -62,15 +62,16 @@ for card in ("PSFID", "PSFVERS", "PSFSTAT", "DCNVMETH", "DCNVITER"):
 # More about the result
 # ---------------------
 #
-# With ``full=True`` the result is a :class:`heliopsf.Deconvolution`. It also has the plane QUALITY, the changes, and plots.
+# With ``full=True`` the result is a :class:`heliopsf.Deconvolution`. It also has the plane QUALITY, the changes, and
+# plots.
 
 result = heliopsf.deconvolve(image, full=True)
 figure, axes = plt.subplots(figsize=(6.4, 4.8))
 result.plot_change(axes).set_title("Change")
 
 # %%
-# QUALITY is 0 for a good pixel; :doc:`Products </products>` explains the other values. Here the pixels near the edges are marked,
-# because a part of their light may come from beyond the image.
+# QUALITY is 0 for a good pixel; :doc:`Products </products>` explains the other values. Here the pixels near the edges
+# are marked, because a part of their light may come from beyond the image.
 
 print(f"good pixels: {100 * (result.quality == 0).mean():.0f} %")
 change = result.changes["change_pct"]
@@ -84,5 +85,5 @@ print(f"1 % of the pixels gain at least {change['p99']:.0f} %")
 #
 #    $ heliopsf deconvolve image.fits -o sharp.fits --local
 #
-# Next: :doc:`2_aia` compares a PSF with the PSF of another program. The page :doc:`/python` lists all forms of images that
-# heliopsf accepts.
+# Next: :doc:`2_aia` compares a PSF with the PSF of another program. The page :doc:`/python` lists all forms of images
+# that heliopsf accepts.

@@ -2,8 +2,8 @@
 AIA at 171 Å beside aiapy
 =========================
 
-heliopsf builds the PSFs of the seven EUV channels of AIA from their filter meshes, as aiapy does. This tutorial shows the
-PSF at 171 Å and compares it with the PSF of aiapy.
+heliopsf builds the PSFs of the seven EUV channels of AIA from their filter meshes, as aiapy does. This tutorial shows
+the PSF at 171 Å and compares it with the PSF of aiapy.
 
 aiapy does not run on this page. The numbers of aiapy come from :doc:`the comparison of all channels </aia>`, which
 ``make bench-peers`` computes with aiapy 0.10.2.
@@ -50,8 +50,8 @@ axes.plot(radii_px, aiapy_pct, "o", color="black", label="aiapy")
 axes.legend(frameon=False)
 
 # %%
-# The curve falls at the diffraction orders of the entrance meshes, which are 16.26 px apart. The values differ by at most
-# 0.2 percentage points. :doc:`The comparison of all channels </aia>` gives the reasons.
+# The curve falls at the diffraction orders of the entrance meshes, which are 16.26 px apart. The values differ by at
+# most 0.2 percentage points. :doc:`The comparison of all channels </aia>` gives the reasons.
 #
 # Replace a call of aiapy
 # -----------------------
@@ -66,5 +66,5 @@ axes.legend(frameon=False)
 # A PSF of aiapy is an array. heliopsf deconvolves with such an array too: ``heliopsf.deconvolve(image, psf=array)``.
 # The page :doc:`/python` lists the differences.
 #
-# This PSF describes diffraction alone. AIA also scatters light diffusely; this light stays in the image. To remove it, fit
-# the scatter to a transit, as in :doc:`4_transit`.
+# This PSF describes diffraction alone. AIA also scatters light diffusely; this light stays in the image. To remove it,
+# fit the scatter to a transit, as in :doc:`4_transit`.

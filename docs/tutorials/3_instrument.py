@@ -23,8 +23,8 @@ file = Path(folder.name) / "small_telescope.toml"
 # Write the file
 # --------------
 #
-# The telescope has an aperture of 60 mm and one filter mesh at its entrance. The table ``[scatter]`` describes the diffuse
-# scatter. :doc:`The instrument file </instruments>` explains every key.
+# The telescope has an aperture of 60 mm and one filter mesh at its entrance. The table ``[scatter]`` describes the
+# diffuse scatter. :doc:`The instrument file </instruments>` explains every key.
 
 text = """
 name = "small_telescope"
@@ -109,8 +109,8 @@ except heliopsf.DataError as error:
 # Deconvolve with this PSF
 # ------------------------
 #
-# Give the PSF to :func:`heliopsf.deconvolve`. The image here is a simulated scene as a ``CCDData`` of astropy. heliopsf compares
-# the wavelength and the plate scale of image and PSF.
+# Give the PSF to :func:`heliopsf.deconvolve`. The image here is a simulated scene as a ``CCDData`` of astropy. heliopsf
+# compares the wavelength and the plate scale of image and PSF.
 
 scene = solar_scene((256, 256), seed=5)
 header = {"DETECTOR": "SMALL", "WAVELNTH": 195, "CDELT1": 0.99, "CUNIT1": "arcsec"}

@@ -2,9 +2,9 @@
 Is the gap real?
 ================
 
-A fitted PSF never reproduces a transit exactly. The *gap* is the part of the residuals that noise does not explain. The gap
-diagnosis states where the gap lies, which cause explains it, and how far it shrinks with this cause in the model. This tutorial
-adds a known error to a simulated transit and reads the diagnosis.
+A fitted PSF never reproduces a transit exactly. The *gap* is the part of the residuals that noise does not explain. The
+gap diagnosis states where the gap lies, which cause explains it, and how far it shrinks with this cause in the model.
+This tutorial adds a known error to a simulated transit and reads the diagnosis.
 """
 
 from pathlib import Path
@@ -47,11 +47,11 @@ print(report["cautions"] or "No cautions.")
 # The causes
 # ----------
 #
-# The report lists the causes that act together; here there is one. Each cause has one or more alternatives: one of them is the
-# cause. An alternative is an effect of the library, or another form of a family: a change of this kind whose form the library
-# does not have. The *level* of a cause says what is sure: the name of an effect, a family, a stage (scene, optics or detector),
-# or none of these (``open``). On transits like those of the calibration, the alternatives contain a true cause with a
-# probability of 90 % (``coverage``).
+# The report lists the causes that act together; here there is one. Each cause has one or more alternatives: one of them
+# is the cause. An alternative is an effect of the library, or another form of a family: a change of this kind whose
+# form the library does not have. The *level* of a cause says what is sure: the name of an effect, a family, a stage
+# (scene, optics or detector), or none of these (``open``). On transits like those of the calibration, the alternatives
+# contain a true cause with a probability of 90 % (``coverage``).
 
 print("verdict:", report["verdict"])
 for cause in report["causes"]:
@@ -60,16 +60,17 @@ for cause in report["causes"]:
         print(f"  {one['words']} ({one['stage']}, family {one['family']}): {one['probability']:.3f}")
 
 # %%
-# The figure shows the effects with the highest probabilities. The bars show the closure: the share of the gap in held-out
-# images that disappears when the effect is added to the model. A high closure does not identify the cause, because another
-# effect can look alike; the probabilities at the right decide. They need not sum to 1, because several effects can act together.
+# The figure shows the effects with the highest probabilities. The bars show the closure: the share of the gap in
+# held-out images that disappears when the effect is added to the model. A high closure does not identify the cause,
+# because another effect can look alike; the probabilities at the right decide. They need not sum to 1, because several
+# effects can act together.
 
 figure, axes = plt.subplots(figsize=(8, 5), layout="constrained")
 gap.plot(axes)
 
 # %%
-# The report states the size of each effect with its error, and the closure with its 90 % interval. The interval is wide here,
-# because the gap is only twice the noise.
+# The report states the size of each effect with its error, and the closure with its 90 % interval. The interval is wide
+# here, because the gap is only twice the noise.
 
 best = report["effects"][0]
 offset = best["parameters"]["offset"]
@@ -81,8 +82,9 @@ print(f"closure on held-out images: {report['closure']['value']:.2f} ({low:.2f} 
 # What these data could have shown
 # --------------------------------
 #
-# An effect that is not told may act, but too weakly to be seen. ``found_90`` is the strength with which the effect excludes
-# "no cause" in 90 % of observations; ``excluded_95`` is the strength above which these data exclude the effect.
+# An effect that is not told may act, but too weakly to be seen. ``found_90`` is the strength with which the effect
+# excludes "no cause" in 90 % of observations; ``excluded_95`` is the strength above which these data exclude the
+# effect.
 
 print(f"{'effect':20} {'found_90':>10} {'excluded_95':>12}")
 for name in ("dark_offset", "intensity_gradient", "column_smear", "ghost"):
@@ -94,13 +96,14 @@ for name in ("dark_offset", "intensity_gradient", "column_smear", "ghost"):
 # What next?
 # ----------
 #
-# ``gap.quicklook()`` draws the whole diagnosis, and ``heliopsf gap transit -o gap.html`` writes it as a page. What to do next
-# depends on the verdict:
+# ``gap.quicklook()`` draws the whole diagnosis, and ``heliopsf gap transit -o gap.html`` writes it as a page. What to
+# do next depends on the verdict:
 #
 # - ``attributed``: correct the cause, here the dark level, and fit again. ``heliopsf gap transit --corrected psf.fits``
 #   writes a PSF that was fitted with the effect in the model.
 # - ``tie``: ``report["would_separate"]`` names the observation that would separate the effects.
 # - ``none``: no gap was found. The limits state how strong an effect can still be.
-# - ``unknown`` or ``inconclusive``: at least one alternative is a form that the library does not have. ``report["causes"]``
-#   has its family, and where possible a map or a curve of it; see :doc:`the gap diagnosis </gap>`, which also states how often
-#   the diagnosis is right. :doc:`Two real transits </real_transits>` shows what can be said without a diagnosis.
+# - ``unknown`` or ``inconclusive``: at least one alternative is a form that the library does not have.
+# ``report["causes"]`` has its family, and where possible a map or a curve of it; see :doc:`the gap diagnosis </gap>`,
+# which also states how often the diagnosis is right. :doc:`Two real transits </real_transits>` shows what can be said
+# without a diagnosis.

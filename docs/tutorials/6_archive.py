@@ -2,8 +2,8 @@
 An archive in an afternoon
 ==========================
 
-A service deconvolves many images with the same certified PSF, and records which PSF made which product. This tutorial runs a
-whole service with a small archive of simulated images. Every step is shown as a command and in Python.
+A service deconvolves many images with the same certified PSF, and records which PSF made which product. This tutorial
+runs a whole service with a small archive of simulated images. Every step is shown as a command and in Python.
 """
 
 import os
@@ -26,7 +26,8 @@ from psfcore.simulate.transit import simulate, write
 # The archive
 # -----------
 #
-# The archive of this tutorial is a folder with twelve images of 128 px. The PSF is cut to 256 px, which makes the run faster.
+# The archive of this tutorial is a folder with twelve images of 128 px. The PSF is cut to 256 px, which makes the run
+# faster.
 
 temporary = TemporaryDirectory()
 archive, products = Path(temporary.name, "archive"), Path(temporary.name, "products")
@@ -48,8 +49,9 @@ small.write(Path(temporary.name, "psf.fits"))
 #    $ export HELIOPSF_BULK_ROOTS=/archive HELIOPSF_BULK_OUTPUT_ROOTS=/products
 #    $ heliopsf serve
 #
-# The service reads only folders in the first variable, and writes only to folders in the second. ``heliopsf serve`` also starts a
-# worker. To use more machines, start ``heliopsf worker`` on each of them; the page :doc:`/operating` explains how.
+# The service reads only folders in the first variable, and writes only to folders in the second. ``heliopsf serve``
+# also starts a worker. To use more machines, start ``heliopsf worker`` on each of them; the page :doc:`/operating`
+# explains how.
 
 service = subprocess.Popen(
     ["heliopsf", "serve", "--port", "0", "--data", str(Path(temporary.name, "data"))],
@@ -104,8 +106,8 @@ print(run["phase"], run["images"])
 # -------------------
 #
 # The report of the run lists the highest artefact scores first. Look at these products before you publish the others.
-# Here the highest scores belong to images in which the dark disc of the occulter looks like an artefact. The folder also
-# contains a PSF; the run refuses to deconvolve it, and says why.
+# Here the highest scores belong to images in which the dark disc of the occulter looks like an artefact. The folder
+# also contains a PSF; the run refuses to deconvolve it, and says why.
 
 command = ["heliopsf", "bulk", "report", run["id"], "--server", address, "--most", "5"]
 print(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
@@ -134,8 +136,8 @@ figure.colorbar(right.images[0], ax=[left, right], label="DN")
 #    $ heliopsf bulk retry ID
 #    $ heliopsf bulk report ID -o manifest.csv
 #
-# The same image, PSF and parameters always give the same product. If you submit the run again, for example after a power
-# failure, no image is processed twice.
+# The same image, PSF and parameters always give the same product. If you submit the run again, for example after a
+# power failure, no image is processed twice.
 
 # %%
 # Stop the service. In a terminal, press Control-C.

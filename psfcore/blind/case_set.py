@@ -222,7 +222,8 @@ def _remember(blind_set: BlindSet, plan: SetPlan, scenes: Sequence[Plane]) -> No
         if any(before.get(key) != value for key, value in about.items() if key != "cases"):
             raise DataError(
                 "other-set",
-                f"expected an empty folder, or a set that was made with {about}; {blind_set.folder} contains a set that "
+                f"expected an empty folder, or a set that was made with {about}; {blind_set.folder} contains a set "
+                "that "
                 f"was made with {before}. Choose another folder",
             )
     elif blind_set.folder.is_dir() and (

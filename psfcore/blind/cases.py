@@ -61,11 +61,12 @@ _KIND_STREAM, _TRUTH_STREAM, _EFFECT_STREAM = 1, 2, 3
 class SetPlan:
     """The plan of a set.
 
-    cases: number of cases. size_px, images: of each transit. only: names of effects; every case has one of them, in turn. clean_only: no case has an effect. built_diffraction: True: half of
-    the cases have the diffraction PSF of the instrument, and half a synthetic one. False: all have a synthetic one.
-    left_pct: the residuals (percent) that an effect should leave in the discs after a refit. The values are used in
-    turn, each for all names of `only`. Empty: the residuals are drawn at random; for the names of `only` from
-    USUAL_PCT. withheld: the group of withheld effects, a key of WITHHELD.
+    cases: number of cases. size_px, images: of each transit. only: names of effects; every case has one of them, in
+    turn. clean_only: no case has an effect. built_diffraction: True: half of the cases have the diffraction PSF of the
+    instrument, and half a synthetic one. False: all have a synthetic one. left_pct: the residuals (percent) that an
+    effect should leave in the discs after a refit. The values are used in turn, each for all names of `only`. Empty:
+    the residuals are drawn at random; for the names of `only` from USUAL_PCT. withheld: the group of withheld effects,
+    a key of WITHHELD.
     """
 
     cases: int
@@ -172,7 +173,8 @@ def _pair(seed: int, count: int) -> list[tuple[str, Range]]:
 
 def _in_turn(seed: int, count: int, names: Sequence[str], stream: int) -> str:
     """Entry `count` of an endless list of the names. The order is random, but every name occurs once before any is
-    repeated."""
+    repeated.
+    """
     turn, place = divmod(count, len(names))
     order = np.random.default_rng([seed, turn, _KIND_STREAM, 3 + stream]).permutation(len(names))
     return str(names[order[place]])
@@ -180,7 +182,8 @@ def _in_turn(seed: int, count: int, names: Sequence[str], stream: int) -> str:
 
 def _plan(size_px: int, images: int, rng: np.random.Generator) -> Plan:
     """The default transit with random changes: it may be upside down, and tracks, brightness and noise are
-    different."""
+    different.
+    """
     plan = default_plan(
         images,
         size_px,
@@ -229,7 +232,8 @@ def case_scenes(case: Case, images: Sequence[Plane] = ()) -> dict[int, Plane]:
 
 def _with_own_statistics(scene: Plane, case: Case, pointing: int) -> Plane:
     """Add to a synthetic scene: broad and fine modulation, compact brightenings with power-law brightness, and a
-    constant."""
+    constant.
+    """
     rng = np.random.default_rng([case.seed, pointing, 4])
     n, seed = scene.shape[0], int(rng.integers(2**31))
     broad, fine = patches(n, seed, float(rng.uniform(0.1, 0.4))), patches(n, seed + 1, 0.015)

@@ -140,8 +140,9 @@ class Cause:
 
     @property
     def is_on_axis(self) -> bool | None:
-        """Whether the gap of the report varies most along an axis of the effect; None if the case has another cause too,
-        or the effect has no axis."""
+        """Whether the gap of the report varies most along an axis of the effect; None if the case has another cause
+        too, or the effect has no axis.
+        """
         strongest = (self.case.report.get("where") or [{}])[0].get("axis")
         axes = AXES.get(self.effect["name"])
         return None if axes is None or not self.is_only else strongest in axes
@@ -162,7 +163,8 @@ class Cause:
     @cached_property
     def map(self) -> tuple[float, float] | None:
         """The distance of the peak of the report's map from the true one, in units of half the field, and the
-        correlation of the maps; None if the truth or an entry of the right family has no map."""
+        correlation of the maps; None if the truth or an entry of the right family has no map.
+        """
         fields = (entry.get("field") or {} for entry in self.right_entries(FAMILY))
         stated = next((field["map"] for field in fields if "map" in field), None)
         light = self.effect.get("light_map")

@@ -106,7 +106,8 @@ def _effect(simulation: Simulation, left_pct: float, clean: Simulation) -> dict[
 
 def _map(change: Plane) -> list[list[float]]:
     """The change of the images [y, x], DN/s, at MAP_POINTS x MAP_POINTS points, each the mean of a box around the
-    point."""
+    point.
+    """
     step = change.shape[0] / MAP_POINTS
     at = (np.arange(MAP_POINTS) + 0.5) * step - 0.5
     boxes = uniform_filter(change, max(1, round(step)), mode="nearest")
@@ -146,7 +147,8 @@ def _file(n: int) -> str:
 
 def _frames(simulation: Simulation) -> tuple[Frame, ...]:
     """Frames of mean images, with the exact positions of the occulter. Clipped pixels are filled as in a transit from
-    a folder."""
+    a folder.
+    """
     exposures = []
     for n, (rate, shot) in enumerate(zip(simulation.mean, simulation.plan.shots, strict=True)):
         level = simulation.level if simulation.level is not None and shot.gain_mode == HIGH else np.inf

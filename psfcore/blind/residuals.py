@@ -71,7 +71,8 @@ class LinearEstimator:
 
     def clean_left_pct(self) -> list[float]:
         """The residual of every image without effects after the refit, e_i of Eq. (1), percent: what sampling on
-        pixels leaves."""
+        pixels leaves.
+        """
         return self._left_by_image(self._residuals)
 
     def _left_by_image(self, residuals: Sequence[Vector]) -> list[float]:

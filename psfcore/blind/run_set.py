@@ -38,7 +38,8 @@ _LAST_WORDS = 2000
 @dataclass(frozen=True)
 class Run:
     """One run of a program: its wall time, its largest memory and its exit status. error: the reason if it gave no
-    result."""
+    result.
+    """
 
     case: int
     wall_s: float

@@ -40,7 +40,9 @@ class EffectFree:
 
     @cached_property
     def lights(self) -> list[NDArray[np.float32]]:
-        """The light of every image in the focal plane, on fine pixels [y, x], DN/s; computed once for many simulations."""
+        """The light of every image in the focal plane, on fine pixels [y, x], DN/s; computed once for many
+        simulations.
+        """
         return [light.astype(np.float32) for light in focal_planes(self, ())]
 
 
@@ -64,7 +66,8 @@ class Simulation:
     @cached_property
     def rates(self) -> list[Plane]:
         """The expected light of every image on detector pixels [y, x], DN/s, before the readout. It contains no
-        noise."""
+        noise.
+        """
         lights: Iterable[NDArray[np.floating]] = self.clean.lights
         if any(effect.strength and effect.kind.step in _SKY_STEPS for effect in self.effects):
             lights = focal_planes(self.clean, self.effects)

@@ -104,8 +104,8 @@ def linear_convolve(
 ) -> NDArray[np.float64]:
     """Convolve two kernels linearly, in float64. The centre of each kernel is at [ny // 2, nx // 2].
 
-    a may be a stack of kernels (..., ny, nx). The last two axes of the result have the shape `out_shape`, and its centre is at
-    [ny // 2, nx // 2] too. Light outside is cut off.
+    a may be a stack of kernels (..., ny, nx). The last two axes of the result have the shape `out_shape`, and its
+    centre is at [ny // 2, nx // 2] too. Light outside is cut off.
     """
     length = tuple(
         int(scipy.fft.next_fast_len(p + q - 1, real=True))

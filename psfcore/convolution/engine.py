@@ -62,7 +62,8 @@ class Scratch(NamedTuple):
 
 class Lines(NamedTuple):
     """The rows or columns of a spectrum for a kernel, which takes them as one argument: with the working memory of a
-    thread and the plan of the transform."""
+    thread and the plan of the transform.
+    """
 
     spectrum: Single
     buffer: Single
@@ -159,7 +160,9 @@ class Engine:
     # Steps that a method combines -------------------------------------------------------------------
 
     def to_lanes(self, field: NDArray[np.floating], *, padding: float = 0.0) -> Single:
-        """Convert a field (ny, nx) to the engine's layout. Additional rows that complete the last block hold `padding`."""
+        """Convert a field (ny, nx) to the engine's layout. Additional rows that complete the last block hold
+        `padding`.
+        """
         if field.shape != self.field_shape:
             raise DataError("field-shape", f"expected a field of {self.field_shape}; got {field.shape}")
         return self.lanes_of(lambda rows: field[rows], padding=padding)
@@ -203,7 +206,8 @@ class Engine:
 
     def columns(self, *, adjoint: bool) -> None:
         """Transform the columns, multiply by the transfer function, and transform back. adjoint: multiply by its
-        conjugate."""
+        conjugate.
+        """
         self.multiply_columns(self.transfer, conjugate=adjoint)
 
     def multiply_columns(self, transfer: Single, *, conjugate: bool = False) -> None:
@@ -244,7 +248,8 @@ class Engine:
         return [one(0)] if chunks == 1 else self._shared_out(one, chunks)
 
     def _shared_out(self, one: Callable[[int], Result], chunks: int) -> list[Result]:
-        """Process all chunks and return their results. The calling thread works too; each thread takes the next free chunk.
+        """Process all chunks and return their results. The calling thread works too; each thread takes the next free
+        chunk.
 
         The chunks are not handed to a thread one by one: for a small image, it takes longer to wake a thread than to
         process a chunk.

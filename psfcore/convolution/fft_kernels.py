@@ -6,14 +6,14 @@ order. A convolution multiplies the two spectra between these transforms, so the
 `Plan.place` gives the index of each frequency.
 
 Sixteen signals ("lanes") are stored side by side, so each butterfly is one operation on sixteen neighbours. A buffer is
-a flat float32 array, [index][re, im][lane]. A butterfly is written down as vector instructions (`_butterfly`). If it were
-a loop over the lanes, the compiler would have to prove for each length that the inputs of a butterfly ("legs") do not
-overlap, which takes most of the time to compile on the first run. The radix-4 or radix-2 pass comes before the radix-8
-passes.
+a flat float32 array, [index][re, im][lane]. A butterfly is written down as vector instructions (`_butterfly`). If it
+were a loop over the lanes, the compiler would have to prove for each length that the inputs of a butterfly ("legs") do
+not overlap, which takes most of the time to compile on the first run. The radix-4 or radix-2 pass comes before the
+radix-8 passes.
 
-There is one pass for each radix. A plan holds the addresses of its passes, and `forward` and `inverse` call the passes by
-address. A pass is compiled when the first plan needs it, and kernels that transform do not contain copies of the passes:
-otherwise the first deconvolution of an installation would compile all passes, five times.
+There is one pass for each radix. A plan holds the addresses of its passes, and `forward` and `inverse` call the passes
+by address. A pass is compiled when the first plan needs it, and kernels that transform do not contain copies of the
+passes: otherwise the first deconvolution of an installation would compile all passes, five times.
 
     X[k] = sum_j x[j] exp(-2 pi i j k / L)                                                          Eq. (1)
 
@@ -57,7 +57,8 @@ Flat = NDArray[np.float32]
 
 
 class Plan(NamedTuple):
-    """How to transform signals of one length, as one argument of the kernels: passes, twiddle factors, and order of the result.
+    """How to transform signals of one length, as one argument of the kernels: passes, twiddle factors, and order of the
+    result.
 
     `passes[0]` and `passes[1]` hold the addresses of the passes of `forward` and `inverse`, `lengths` the lengths of
     their blocks. `place[k]` is the index of frequency k after a forward transform.
@@ -87,7 +88,8 @@ def make_plan(length: int) -> Plan:
         offsets.append(offset)
         twiddles.append(table.ravel())
         offset += table.size
-        # Block q of this pass holds the frequencies congruent to q modulo the radix: the first pass gives the lowest digit.
+        # Block q of this pass holds the frequencies congruent to q modulo the radix: the first pass gives the lowest
+        # digit.
         frequency = (frequency[:, None] + scale * np.arange(radix)[None, :]).ravel()
         scale *= radix
         n = m
@@ -164,8 +166,8 @@ def _dft8(*legs: Leg) -> list[Leg]:
     return [leg for pair in zip(even, odd, strict=True) for leg in pair]
 
 
-# Which of two products is rounded with their sum makes no difference for the accuracy. For these legs of a forward pass it is
-# the other one, because results must be those of earlier versions, bit for bit.
+# Which of two products is rounded with their sum makes no difference for the accuracy. For these legs of a forward pass
+# it is the other one, because results must be those of earlier versions, bit for bit.
 _ROUNDED_LAST = {4: (1, 3), 8: (2, 6)}
 _DFT: dict[int, Callable[..., list[Leg]]] = {2: _dft2, 3: _dft3, 4: _dft4, 8: _dft8}
 
@@ -183,8 +185,8 @@ def _butterfly(
 ) -> Written:
     """One butterfly on all lanes: the legs are the elements first + q step of the buffer x.
 
-    The factors of the legs 1, 2, ... begin at table[at]. radix and backward are constants; backward = 1: the inverse, which
-    exchanges real and imaginary parts.
+    The factors of the legs 1, 2, ... begin at table[at]. radix and backward are constants; backward = 1: the inverse,
+    which exchanges real and imaginary parts.
     """
     legs, inverse = range(radix.literal_value), bool(backward.literal_value)
     real, imaginary = (LANES, 0) if inverse else (0, LANES)

@@ -1,9 +1,9 @@
 """Instructions on sixteen neighbouring numbers ("lanes"), for the kernels (`@compiled`) of `fft_kernels` and `engine`.
 
-A kernel calls the functions of this module like other functions; each of them becomes vector instructions. Loops over the
-lanes would have the same meaning. However, the compiler can turn such a loop into vector instructions only after it has
-proved that the arrays of the loop do not overlap, and for many arrays it fails, or spends most of the time of the first run
-of an installation.
+A kernel calls the functions of this module like other functions; each of them becomes vector instructions. Loops over
+the lanes would have the same meaning. However, the compiler can turn such a loop into vector instructions only after it
+has proved that the arrays of the loop do not overlap, and for many arrays it fails, or spends most of the time of the
+first run of an installation.
 
 Arrays are float32, contiguous, and addressed by the index of a number in the flat array.
 """
@@ -27,8 +27,8 @@ LANES = 16
 
 # What an intrinsic of numba returns: the types of its arguments, and the function that writes its instructions.
 Written = tuple[Signature, Callable[..., ir.Value]]
-# numba gives the decorated function the context of the compiler and the types of the arguments. Kernels call it with the
-# arguments alone.
+# numba gives the decorated function the context of the compiler and the types of the arguments. Kernels call it with
+# the arguments alone.
 instruction: Callable[[Callable[..., Written]], Callable[..., object]] = intrinsic
 # The types of constant arguments hold their values.
 instruction_of_constants: Callable[[Callable[..., Written]], Callable[..., object]] = intrinsic(
@@ -67,7 +67,7 @@ class Vector:
         return Vector(self.builder, self.builder.fneg(self.value))
 
     def times_plus(self, factor: Vector, summand: Vector) -> Vector:
-        """self * factor + summand, rounded once if the processor has an instruction for it."""
+        """Self * factor + summand, rounded once if the processor has an instruction for it."""
         kind = self.value.type
         fused = get_or_insert_function(
             self.builder.module, ir.FunctionType(kind, [kind] * 3), f"llvm.fmuladd.v{kind.count}f32"
@@ -115,7 +115,9 @@ def _places(indices: Sequence[int]) -> ir.Constant:
 
 @cache
 def width() -> int:
-    """The number of lanes in a vector register of this processor; 8 is good for processors with shorter registers too."""
+    """The number of lanes in a vector register of this processor; 8 is good for processors with shorter registers
+    too.
+    """
     return 16 if get_host_cpu_features().get("avx512f") else 8
 
 
@@ -125,7 +127,9 @@ def parts() -> range:
 
 
 def written(write: Callable[..., None], arrays: Sequence[types.Type], numbers: int) -> Written:
-    """What an intrinsic of numba returns. write(*memories, *indices) writes the instructions for these types of arrays."""
+    """What an intrinsic of numba returns. write(*memories, *indices) writes the instructions for these types of
+    arrays.
+    """
     for kind in arrays:
         if not (isinstance(kind, types.Array) and kind.layout == "C" and kind.dtype == types.float32):
             raise TypingError(f"expected a contiguous array of float32; got {kind}: copy it")
@@ -205,7 +209,9 @@ def _write_transpose(
 
 
 def _transposed(builder: ir.IRBuilder, rows: list[ir.Value]) -> list[ir.Value]:
-    """The transpose of a square of vectors: for each power of two, the off-diagonal squares of that size are exchanged."""
+    """The transpose of a square of vectors: for each power of two, the off-diagonal squares of that size are
+    exchanged.
+    """
     rows, count = list(rows), len(rows)
     distance = count // 2
     while distance:

@@ -1,4 +1,6 @@
-"""The lengths of Fourier transforms. This file imports no numerical libraries, because estimates of memory need it too."""
+"""The lengths of Fourier transforms. This file imports no numerical libraries, because estimates of memory need it
+too.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,9 @@ _ODD_FACTORS = (1, 3, 9)
 
 
 def good_length(at_least: int) -> int:
-    """The smallest supported length >= `at_least`. Supported are 2^a, 3 2^a and 9 2^a with a >= 4. Raises ValueError."""
+    """The smallest supported length >= `at_least`. Supported are 2^a, 3 2^a and 9 2^a with a >= 4. Raises
+    ValueError.
+    """
     candidates = [odd << a for odd in _ODD_FACTORS for a in range(4, 15) if odd << a <= LARGEST_LENGTH]
     fitting = [length for length in candidates if length >= at_least]
     if not fitting:

@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 def needed_kernel(
     psf_kernel: NDArray[np.floating], field_shape: tuple[int, int]
 ) -> tuple[NDArray[np.floating], tuple[int, int]]:
-    """Cut a kernel to the offsets that can connect two pixels of the field; also return the offset of its first pixel."""
+    """Cut a kernel to the offsets that can connect two pixels of the field; also return the offset of its first
+    pixel.
+    """
     (y0, y1), (x0, x1) = (_needed(n, size) for n, size in zip(psf_kernel.shape, field_shape, strict=True))
     return psf_kernel[y0:y1, x0:x1], (y0 - psf_kernel.shape[0] // 2, x0 - psf_kernel.shape[1] // 2)
 

@@ -1,4 +1,6 @@
-"""A box of an image that is deconvolved alone. This module imports no numerical libraries, because the web process uses it."""
+"""A box of an image that is deconvolved alone. This module imports no numerical libraries, because the web process uses
+it.
+"""
 
 from __future__ import annotations
 
@@ -48,18 +50,22 @@ class Box:
         return self.y1 - self.y0, self.x1 - self.x0
 
     def checked(self, shape: Shape) -> Box:
-        """This box, if it lies in an image of this shape (ny, nx). Raises DataError "region-outside" or "region-too-small"."""
+        """This box, if it lies in an image of this shape (ny, nx). Raises DataError "region-outside" or
+        "region-too-small".
+        """
         ny, nx = shape
         if not (0 <= self.x0 < self.x1 <= nx and 0 <= self.y0 < self.y1 <= ny):
             raise DataError(
                 "region-outside",
-                f"expected a region x0:x1,y0:y1 with 0 <= x0 < x1 <= {nx} and 0 <= y0 < y1 <= {ny}, the size of the image; "
+                f"expected a region x0:x1,y0:y1 with 0 <= x0 < x1 <= {nx} and 0 <= y0 < y1 <= {ny}, the size of the "
+                "image; "
                 f"got {self}",
             )
         if min(self.shape) < SMALLEST_BOX_PX:
             raise DataError(
                 "region-too-small",
-                f"expected a region of at least {SMALLEST_BOX_PX} px per side; got {self.shape[1]} x {self.shape[0]} px",
+                f"expected a region of at least {SMALLEST_BOX_PX} px per side; got {self.shape[1]} x {self.shape[0]} "
+                "px",
             )
         return self
 
@@ -91,6 +97,7 @@ def region_without_errors(draws: int) -> DataError:
     """The error for a request for a region with an ERROR plane."""
     return DataError(
         "region-errors",
-        "expected error_draws 0 with a region, because the noise of the light that is subtracted would be missing in the errors; "
+        "expected error_draws 0 with a region, because the noise of the light that is subtracted would be missing in "
+        "the errors; "
         f"got {draws}: leave it out, or deconvolve the whole image",
     )

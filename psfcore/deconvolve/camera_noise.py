@@ -1,18 +1,18 @@
 """The noise of the camera of an image: published for its telescope, or measured in the image (photon transfer).
 
-The pixels are divided into classes of equal brightness D, the mean of 3 x 3 pixels. The variance V of a pixel follows from the
-second differences in a class (`psfcore.deconvolve.assess.artefacts`), whose noise is independent of that of the mean. The
-figures of the camera follow from
+The pixels are divided into classes of equal brightness D, the mean of 3 x 3 pixels. The variance V of a pixel follows
+from the second differences in a class (`psfcore.deconvolve.assess.artefacts`), whose noise is independent of that of
+the mean. The figures of the camera follow from
 
     V = g D + r^2                                                                          Eq. (1)
 
-g is the median of the slopes between all pairs of classes (Theil 1950, Indag. Math. 12, 85), and r^2 the median of V - g D of
-the fainter half of the classes, so a few classes with much structure change neither. Their uncertainties are those of the mean of the four quarters of
-the image.
+g is the median of the slopes between all pairs of classes (Theil 1950, Indag. Math. 12, 85), and r^2 the median of V -
+g D of the fainter half of the classes, so a few classes with much structure change neither. Their uncertainties are
+those of the mean of the four quarters of the image.
 
-Structure on the scale of a pixel raises V. Noise that neighbouring pixels share lowers it: in images of the EUV channels of
-AIA, whose charge spreads over several pixels, the measured g is 0.4 of the published one. The published figures are used, because
-they also hold for means of pixels; for a single pixel they are an upper limit.
+Structure on the scale of a pixel raises V. Noise that neighbouring pixels share lowers it: in images of the EUV
+channels of AIA, whose charge spreads over several pixels, the measured g is 0.4 of the published one. The published
+figures are used, because they also hold for means of pixels; for a single pixel they are an upper limit.
 
 | symbol | name | unit |
 |---|---|---|
@@ -87,8 +87,8 @@ class CameraNoise(Noise):
 def camera_noise(image: Image, given: Noise | None, *, binning: int) -> CameraNoise:
     """The noise of an image: the given one, or else the published one, or else the measured one.
 
-    binning: an image pixel is the mean of binning x binning pixels of the camera. Raises DataError "no-noise-figures" if none
-    is known and the pixels show none, and "no-exposure".
+    binning: an image pixel is the mean of binning x binning pixels of the camera. Raises DataError "no-noise-figures"
+    if none is known and the pixels show none, and "no-exposure".
     """
     if isinstance(given, CameraNoise):
         return given
@@ -150,7 +150,7 @@ def _mean_of_lowest(values: Plane) -> float:
 
 
 def _transfer(pixels: Any, counted: Any, sigma: Any) -> tuple[float, float] | None:
-    """g and r of Eq. (1) in the unit of the pixels; None for too few pixels."""
+    """G and r of Eq. (1) in the unit of the pixels; None for too few pixels."""
     classes = classes_of(uniform_filter(pixels, 3)[counted])
     if not classes.centres.size:
         return None

@@ -73,17 +73,15 @@ class OfBox:
 class Deconvolved:
     """An estimate of the scene, and how the method reached it.
 
-    pixels: estimate [y, x] in the image's unit; NaN where the image has no finite value.
-    stopped_because: reason why the iteration ended.
-    flux_in: sum of the image over its valid pixels. Negative pixels are included.
-    flux_out: sum of the estimate over the same pixels. negative_pixels: number of valid pixels below 0 in the image.
-    last_change: rms of the change in the last step, divided by the rms of the estimate.
-    edges, margin_px: assumption about the scene beyond the field, and width of the margin.
-    edge_band_px: width of the band along the edges in which the result depends on light from beyond the field.
-    noise_amplification: rms noise of the estimate divided by the rms noise of the image, for uncorrelated noise; None if
-    the method is not linear. chi2_per_pixel: chi2 of the fit divided by the number of judged pixels
-    (`psfcore.deconvolve.problem`); None if the noise is not known. of_box: how the box was deconvolved, if the result is a
-    box of an image; None for a whole image.
+    pixels: estimate [y, x] in the image's unit; NaN where the image has no finite value. stopped_because: reason why
+    the iteration ended. flux_in: sum of the image over its valid pixels. Negative pixels are included. flux_out: sum of
+    the estimate over the same pixels. negative_pixels: number of valid pixels below 0 in the image. last_change: rms of
+    the change in the last step, divided by the rms of the estimate. edges, margin_px: assumption about the scene beyond
+    the field, and width of the margin. edge_band_px: width of the band along the edges in which the result depends on
+    light from beyond the field. noise_amplification: rms noise of the estimate divided by the rms noise of the image,
+    for uncorrelated noise; None if the method is not linear. chi2_per_pixel: chi2 of the fit divided by the number of
+    judged pixels (`psfcore.deconvolve.problem`); None if the noise is not known. of_box: how the box was deconvolved,
+    if the result is a box of an image; None for a whole image.
     """
 
     pixels: NDArray[np.float64]
@@ -121,10 +119,11 @@ def fluxes(image: Image, pixels: NDArray[np.float64]) -> tuple[float, float, int
 
 
 class PreparedPsfs:
-    """A cache of PSFs for later images: read, resampled to the pixels of an image, and Fourier-transformed as an engine.
+    """A cache of PSFs for later images: read, resampled to the pixels of an image, and Fourier-transformed as an
+    engine.
 
-    It keeps what was used last, up to ``max_bytes`` together, and always the newest. Only one thread at a time may use it,
-    because all calls of an engine share its buffers.
+    It keeps what was used last, up to ``max_bytes`` together, and always the newest. Only one thread at a time may use
+    it, because all calls of an engine share its buffers.
     """
 
     def __init__(self, max_bytes: int = 2**29) -> None:
@@ -148,7 +147,9 @@ class PreparedPsfs:
         return self._once((key, sampling), lambda: sampling.of(whole), _kernel_bytes)
 
     def engine_for(self, psf: Psf, shape: Shape, span: Shape, threads: int) -> Engine:
-        """The engine for a PSF and a shape. Pass the same PSF object again: the cache compares identity, not content."""
+        """The engine for a PSF and a shape. Pass the same PSF object again: the cache compares identity, not
+        content.
+        """
 
         def make() -> tuple[Psf, Engine]:
             return psf, new_engine(psf, shape, span, threads)

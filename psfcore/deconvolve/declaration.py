@@ -1,7 +1,8 @@
-"""How a method of deconvolution declares itself: its parameters, its assumption about edges, and the memory that it needs.
+"""How a method of deconvolution declares itself: its parameters, its assumption about edges, and the memory that it
+needs.
 
-Requests, options of commands, forms of pages and estimates are made from these objects. This module loads no numerical library,
-because the web process uses it too.
+Requests, options of commands, forms of pages and estimates are made from these objects. This module loads no numerical
+library, because the web process uses it too.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ class Parameter:
 
     @property
     def type(self) -> type[Value]:
-        """int or float, that of the default."""
+        """Int or float, that of the default."""
         return type(self.default)
 
     @property
@@ -60,15 +61,16 @@ def steps(default: int, about: str | None = None) -> Parameter:
 class Method:
     """A method of deconvolution, except its iteration.
 
-    use: for which images it is good, in the first sentence, and what must be known about it. algorithm_version: raise it when the
-    same parameters give another result. edges: the default assumption about the scene beyond the edges. margin_share: largest
-    share of its light that a pixel at the edge may get from beyond the margin; `psfcore.deconvolve.edges.margin_for` computes the
-    default width of the margin from it. may_be_negative: whether results can be negative. keeps_flux: whether the steps conserve
-    the flux of the plane, and so compensate for light that leaves it (`psfcore.deconvolve.work`).
+    use: for which images it is good, in the first sentence, and what must be known about it. algorithm_version: raise
+    it when the same parameters give another result. edges: the default assumption about the scene beyond the edges.
+    margin_share: largest share of its light that a pixel at the edge may get from beyond the margin;
+    `psfcore.deconvolve.edges.margin_for` computes the default width of the margin from it. may_be_negative: whether
+    results can be negative. keeps_flux: whether the steps conserve the flux of the plane, and so compensate for light
+    that leaves it (`psfcore.deconvolve.work`).
 
-    For estimates, measured by `python -m benchmarks.growth memory`; None: not measured, so the largest figure of all methods
-    counts. margin_of_psf: default margin divided by half the width of the PSF. plane_bytes, transform_bytes: see Eq. (1) of
-    `psfcore.deconvolve.memory`.
+    For estimates, measured by `python -m benchmarks.growth memory`; None: not measured, so the largest figure of all
+    methods counts. margin_of_psf: default margin divided by half the width of the PSF. plane_bytes, transform_bytes:
+    see Eq. (1) of `psfcore.deconvolve.memory`.
     """
 
     name: str

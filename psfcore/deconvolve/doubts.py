@@ -1,14 +1,15 @@
-"""Warnings about the inputs of a deconvolution: the PSF, its channel and mesh, and pixels that are not what they should be.
+"""Warnings about the inputs of a deconvolution: the PSF, its channel and mesh, and pixels that are not what they should
+be.
 
-Three signs of wrong pixels are looked for: spikes, a bias that was not subtracted, and values that were scaled for display.
-A spike (a cosmic ray, a hot pixel) is brighter than the PSF allows. The PSF puts the share k of a point's light into the
-brightest of the four nearest pixels; a pixel with the excess e over its surroundings is a spike if its neighbours have less
-than half of the excess that its light alone must give them:
+Three signs of wrong pixels are looked for: spikes, a bias that was not subtracted, and values that were scaled for
+display. A spike (a cosmic ray, a hot pixel) is brighter than the PSF allows. The PSF puts the share k of a point's
+light into the brightest of the four nearest pixels; a pixel with the excess e over its surroundings is a spike if its
+neighbours have less than half of the excess that its light alone must give them:
 
     excess of the brightest neighbour < k e / 2,   e > SPIKE_SIGMA sigma        Eq. (1)
 
-sigma is the scatter between neighbouring pixels. Each block of BLOCK_PX pixels is searched for its brightest pixel only, so the
-number of spikes is a lower bound.
+sigma is the scatter between neighbouring pixels. Each block of BLOCK_PX pixels is searched for its brightest pixel
+only, so the number of spikes is a lower bound.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ LARGEST_CUT = 0.001  # share of the light of a PSF; a PSF sums to 1 with about t
 BLOCK_PX = 16
 SPIKE_SIGMA = 20.0
 FEWEST_SPIKES = 5
-# A bias is suspected if the darkest of 1000 pixels is above this level (DN) and the others reach less far above it than it is.
+# A bias is suspected if the darkest of 1000 pixels is above this level (DN) and the others reach less far above it than
+# it is.
 SMALLEST_BIAS_DN = 50.0
 _SAMPLE = 65_536
 _BESIDE = ((0, 1), (0, -1), (1, 0), (-1, 0))
@@ -48,7 +50,8 @@ def input_warnings(psf: Psf, image: Image, method: str | None, *, other_channel:
     warnings |= {} if channel is None else {"channel": channel}
     if _mesh_is_assumed(psf):
         warnings["assumed-mesh"] = (
-            "the instrument file of the PSF assumes a part of its filter meshes: compare the arms of a bright point with it "
+            "the instrument file of the PSF assumes a part of its filter meshes: compare the arms of a bright point "
+            "with it "
             "(heliopsf arms), or use a published PSF"
         )
     warnings |= image.warnings
@@ -62,7 +65,9 @@ def input_warnings(psf: Psf, image: Image, method: str | None, *, other_channel:
 
 
 def _cut_warning(psf: Psf, image: Image) -> dict[str, str]:
-    """The warning if a PSF that is larger than the usual reach is cut, and more than LARGEST_CUT of its light is cut off."""
+    """The warning if a PSF that is larger than the usual reach is cut, and more than LARGEST_CUT of its light is cut
+    off.
+    """
     if max(psf.kernel.shape) <= REACH_GRID_PX:
         return {}
     needed, _ = needed_kernel(psf.kernel, image.pixels.shape)
@@ -71,7 +76,8 @@ def _cut_warning(psf: Psf, image: Image) -> dict[str, str]:
         return {}
     (ny, nx), (rows, columns) = psf.kernel.shape, needed.shape
     return {
-        "psf-cut": f"of the PSF of {nx} x {ny} px, the image needs {columns} x {rows} px: {100 * off:.3g} % of its light falls "
+        "psf-cut": f"of the PSF of {nx} x {ny} px, the image needs {columns} x {rows} px: {100 * off:.3g} % of its "
+        "light falls "
         "farther, and such light from sources beyond the image is not removed: use a larger image if it matters"
     }
 
@@ -87,7 +93,9 @@ def _mesh_is_assumed(psf: Psf) -> bool:
 
 
 def _negative_warning(image: Image) -> dict[str, str]:
-    """The warning if a method that counts negative pixels as 0 adds more than LARGEST_CLIPPED to the light of the image."""
+    """The warning if a method that counts negative pixels as 0 adds more than LARGEST_CLIPPED to the light of the
+    image.
+    """
     light = float(image.pixels.sum(where=image.valid))
     clipped = -float(image.pixels.sum(where=image.valid & (image.pixels < 0)))
     if clipped <= LARGEST_CLIPPED * abs(light):
@@ -108,7 +116,8 @@ def pixel_warnings(image: Image, psf_kernel: NDArray[np.float64]) -> dict[str, s
     spikes = count_spikes(image, psf_kernel)
     if spikes >= FEWEST_SPIKES:
         warnings["spikes"] = (
-            f"at least {spikes} pixels are brighter than the PSF allows, as cosmic rays are, and spread: use the image after "
+            f"at least {spikes} pixels are brighter than the PSF allows, as cosmic rays are, and spread: use the "
+            "image after "
             "despiking, or mask them"
         )
     sample = image.pixels[image.valid]
@@ -118,7 +127,8 @@ def pixel_warnings(image: Image, psf_kernel: NDArray[np.float64]) -> dict[str, s
         count = parse_unit(image.unit).kind in ("count", "unknown")
         if count and low > SMALLEST_BIAS_DN and high - low < low:
             warnings["bias"] = (
-                f"the darkest pixels are at {low:.4g}, and the others reach to {high:.4g}: if a bias is still in the image, subtract "
+                f"the darkest pixels are at {low:.4g}, and the others reach to {high:.4g}: if a bias is still in the "
+                "image, subtract "
                 "it first"
             )
         whole = np.array_equal(sample, np.rint(sample))
@@ -177,7 +187,9 @@ def _brightest_of_blocks(image: Image) -> tuple[NDArray[np.intp], NDArray[np.int
 
 
 def _scatter(image: Image) -> float:
-    """The standard deviation of the difference between a pixel and the next one, from its median, in a sample of rows."""
+    """The standard deviation of the difference between a pixel and the next one, from its median, in a sample of
+    rows.
+    """
     step = max(1, image.pixels.shape[0] // 64)
     rows = image.pixels[::step]
     difference = np.abs(np.diff(rows, axis=1))

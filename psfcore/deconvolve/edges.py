@@ -86,7 +86,9 @@ class Domain:
         return ny + sought, nx + sought
 
     def cut(self, blocks: Iterable[tuple[int, Plane]]) -> NDArray[np.float64]:
-        """Cut the field out of a plane, in the image's unit. blocks: the number of the first row, and rows of the plane."""
+        """Cut the field out of a plane, in the image's unit. blocks: the number of the first row, and rows of the
+        plane.
+        """
         rows, columns = self.field
         pixels = np.empty((rows.stop - rows.start, columns.stop - columns.start))
         for first, block in blocks:

@@ -32,7 +32,8 @@ SIZE_PX = 32
 def compiling_beside(method: str, shape: tuple[int, int]) -> Iterator[None]:
     """In the block, another process compiles the kernels of a method, if they are not kept on disk yet, but can be.
 
-    shape: (ny, nx) of the image. The block ends when the process has ended. If the process fails, this process compiles the kernels later.
+    shape: (ny, nx) of the image. The block ends when the process has ended. If the process fails, this process compiles
+    the kernels later.
     """
     if is_kept(engine._rows_forward) or not folder_of_kernels()[1]:
         yield
@@ -52,8 +53,8 @@ def compiling_beside(method: str, shape: tuple[int, int]) -> Iterator[None]:
 def compile_kernels(method: str, shape: tuple[int, int]) -> None:
     """Compile the kernels that a method needs for an image of this shape, if they are not kept on disk.
 
-    The margin of the image, and so the length of its transforms, depends on the PSF, which does not exist yet. The usual
-    length is taken; if another one is needed, at most two passes are compiled later.
+    The margin of the image, and so the length of its transforms, depends on the PSF, which does not exist yet. The
+    usual length is taken; if another one is needed, at most two passes are compiled later.
     """
     weights = np.ones((SIZE_PX, SIZE_PX))
     weights[SIZE_PX // 2, SIZE_PX // 2] = SIZE_PX**2

@@ -4,9 +4,9 @@ It follows from the sizes of image and PSF:
 
     bytes = plane_bytes P + transform_bytes L + image_bytes I + psf_bytes K        Eq. (1)
 
-`python -m benchmarks.growth memory` measures both sides of Eq. (1). The size of the margin follows from the PSF, which may not
-exist yet; the figure margin_of_psf of each method was measured with the PSF of HRI_EUV, which scatters much light. This module
-imports no numerical libraries, because the web process uses it too.
+`python -m benchmarks.growth memory` measures both sides of Eq. (1). The size of the margin follows from the PSF, which
+may not exist yet; the figure margin_of_psf of each method was measured with the PSF of HRI_EUV, which scatters much
+light. This module imports no numerical libraries, because the web process uses it too.
 
 | symbol | name | unit |
 |---|---|---|
@@ -108,7 +108,8 @@ def check_memory(image: Shape, needed_bytes: float, free_bytes: int) -> None:
     ny, nx = image
     raise DataError(
         "too-much-memory",
-        f"expected a deconvolution that fits into the free memory, {free_bytes / MIB:.0f} MiB; an image of {nx} x {ny} px "
+        f"expected a deconvolution that fits into the free memory, {free_bytes / MIB:.0f} MiB; an image of {nx} x "
+        f"{ny} px "
         f"needs about {needed_bytes / MIB:.0f} MiB: deconvolve a part of the image "
         "(--region, in Python region=), end other programs, or use a machine with more memory",
         {"needed_mib": round(needed_bytes / MIB), "free_mib": round(free_bytes / MIB)},

@@ -1,8 +1,8 @@
 """The problem of a method: prepare an image for it, run its iteration until it stops, and make the result.
 
-An iteration stops after a fixed number of steps, or by the discrepancy principle (Morozov 1966), when the model fits the
-image as well as the noise allows. The variance is computed from the model image H x, so that the noise of a faint pixel
-does not influence the weight of that pixel:
+An iteration stops after a fixed number of steps, or by the discrepancy principle (Morozov 1966), when the model fits
+the image as well as the noise allows. The variance is computed from the model image H x, so that the noise of a faint
+pixel does not influence the weight of that pixel:
 
     chi2 = 1/n sum over judged pixels of (y - H x)^2 / (g H x + r^2)        Eq. (1)
 
@@ -47,7 +47,8 @@ _ENOUGH_NEIGHBOURS = 1e-4
 
 
 class Iteration:
-    """One step of a method, in two parts. `Problem.solve` calls them in turn, reports progress, and decides when to stop.
+    """One step of a method, in two parts. `Problem.solve` calls them in turn, reports progress, and decides when to
+    stop.
 
     The engine's spectrum carries the data from call to call:
 
@@ -57,8 +58,8 @@ class Iteration:
     - `update` computes the next x from this input. If `last` is false, it leaves the transformed rows of the next x in
       the spectrum.
 
-    x: the estimate, a plane [y, x] or in the engine's layout. change: rms of the change in the last step, divided by the
-    rms of x.
+    x: the estimate, a plane [y, x] or in the engine's layout. change: rms of the change in the last step, divided by
+    the rms of x.
     """
 
     x: NDArray[np.float32]
@@ -82,8 +83,8 @@ class Judgement(NamedTuple):
     """The judged pixels of Eq. (1) and their variance, as one argument of the compiled kernels.
 
     rows [block][half][lane]: 1 for a judged row, else 0. first, last: judged columns, from `first` to `last` - 1.
-    pixels: n. slope, ground: terms of the variance in the domain's scaled unit. sums: for each block of rows, the sum of
-    Eq. (1) without the factor 1/n.
+    pixels: n. slope, ground: terms of the variance in the domain's scaled unit. sums: for each block of rows, the sum
+    of Eq. (1) without the factor 1/n.
     """
 
     rows: NDArray[np.float32]
@@ -102,7 +103,9 @@ class Judgement(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A checked image and PSF, the plane on which the scene is estimated, the engine for that plane, and when to stop."""
+    """A checked image and PSF, the plane on which the scene is estimated, the engine for that plane, and when to
+    stop.
+    """
 
     method: Method
     image: Image

@@ -1,7 +1,7 @@
 """One deconvolution, from an image and its PSF to the product: pixels, planes, cards, history, warnings and details.
 
-The worker, the Python functions and the commands all run `deconvolve`, so that they give the same product for the same image,
-PSF and options. `write` writes it as a FITS file.
+The worker, the Python functions and the commands all run `deconvolve`, so that they give the same product for the same
+image, PSF and options. `write` writes it as a FITS file.
 """
 
 from __future__ import annotations
@@ -75,9 +75,9 @@ class Identities:
 class Product(Deconvolved):
     """A deconvolved image or box, with its inputs, its errors and its warnings.
 
-    image: the input, with its mask. psf: the PSF on the pixels of the image. errors: planes with the standard deviation of each
-    pixel, if they were asked for. noise: that of the camera, if errors were asked for. warnings: sentences by their
-    codes, the most harmful first.
+    image: the input, with its mask. psf: the PSF on the pixels of the image. errors: planes with the standard deviation
+    of each pixel, if they were asked for. noise: that of the camera, if errors were asked for. warnings: sentences by
+    their codes, the most harmful first.
     """
 
     image: Image
@@ -198,8 +198,8 @@ def deconvolve(
     """Deconvolve an image, or the box of it that the options name.
 
     psf: the PSF on the pixels of the image. warnings: those of `input_warnings`, and others about the inputs.
-    possible_psfs, begin: see `Work.errors`. check_plane: called with the shape (ny, nx) of box and rim, which is known only after
-    the image is read; it may raise.
+    possible_psfs, begin: see `Work.errors`. check_plane: called with the shape (ny, nx) of box and rim, which is known
+    only after the image is read; it may raise.
 
     Raises DataError "no-noise-figures", "no-noise-model", and the errors of `box_work` and of the method.
     """
@@ -230,10 +230,11 @@ def deconvolve(
 class PsfSource:
     """The PSF of a deconvolution, which is read or built when it is needed.
 
-    load(header, progress): reads it, or builds it for an image with this header. possible_psfs(psf, header): variants of the PSF
-    within its errors, on the pixels of the image. key: the same for the same PSF; None: the PSF belongs to the telescope in
-    the header. kernel_shape: (ny, nx) of its kernel. plate_scale_arcsec: of a PSF that gives none. prepared: keeps PSFs and engines
-    between images. other_channel: see `input_warnings`. warnings: sentences about the PSF, by their codes.
+    load(header, progress): reads it, or builds it for an image with this header. possible_psfs(psf, header): variants
+    of the PSF within its errors, on the pixels of the image. key: the same for the same PSF; None: the PSF belongs to
+    the telescope in the header. kernel_shape: (ny, nx) of its kernel. plate_scale_arcsec: of a PSF that gives none.
+    prepared: keeps PSFs and engines between images. other_channel: see `input_warnings`. warnings: sentences about the
+    PSF, by their codes.
     """
 
     load: Callable[[Header, Progress | None], Psf]
@@ -258,14 +259,16 @@ def read_and_deconvolve(
     begin: Callable[[str, int], Progress | None],
     say: Callable[[str, str], object] = lambda code, message: None,
 ) -> tuple[Product, Psf]:
-    """Check an image and its PSF, and deconvolve the image in this process. Returns also the PSF as it was read or built.
+    """Check an image and its PSF, and deconvolve the image in this process. Returns also the PSF as it was read or
+    built.
 
-    read: reads the image. shape: its shape (ny, nx), if known from its header; then the job must fit into the free memory,
-    free_bytes. again: also deconvolve a product or a PSF. clip: changes the pixels after the warnings were found; the product contains the unchanged
-    image. begin: see `deconvolve`. say(code, message): called for each warning before the work begins.
+    read: reads the image. shape: its shape (ny, nx), if known from its header; then the job must fit into the free
+    memory, free_bytes. again: also deconvolve a product or a PSF. clip: changes the pixels after the warnings were
+    found; the product contains the unchanged image. begin: see `deconvolve`. say(code, message): called for each
+    warning before the work begins.
 
-    Raises DataError "too-much-memory", "plate-scale-known", "plate-scale-mismatch", "channel-mismatch" and the errors of
-    `check_exposure_of_sun`, of the source and of `deconvolve`.
+    Raises DataError "too-much-memory", "plate-scale-known", "plate-scale-mismatch", "channel-mismatch" and the errors
+    of `check_exposure_of_sun`, of the source and of `deconvolve`.
     """
     box, prepared = options.region, source.prepared
 
@@ -363,7 +366,9 @@ def draw_changes(product: Product, psf: UsedPsf, path: Path) -> None:
 
 
 def deconvolution_cards(product: Product, psf: UsedPsf) -> Cards:
-    """The cards that say how an image was deconvolved. Cards name the warnings by their codes; HISTORY has the sentences."""
+    """The cards that say how an image was deconvolved. Cards name the warnings by their codes; HISTORY has the
+    sentences.
+    """
     # A hash fills the whole card, so cards with a hash have no comment.
     cards: Cards = {
         "PSFID": (psf.id, ""),
@@ -415,7 +420,8 @@ def deconvolution_history(product: Product, psf: UsedPsf) -> list[str]:
             []
             if box is None
             else [
-                f"box {box.box} of the input alone, with a rim of {box.rim_px} px: differs from the same box of the whole "
+                f"box {box.box} of the input alone, with a rim of {box.rim_px} px: differs from the same box of the "
+                "whole "
                 f"image by at most {box.error:.3g} (estimated bound, in the unit of the image)"
             ]
         ),

@@ -1,7 +1,7 @@
 """The work on an image or on a box of it: the estimate, its errors, the measured changes, and the quality plane.
 
-A box is deconvolved alone, with a rim around it and a bound of the error. Only the light of the rim and the box is deconvolved.
-Light from beyond the rim is computed and subtracted first:
+A box is deconvolved alone, with a rim around it and a bound of the error. Only the light of the rim and the box is
+deconvolved. Light from beyond the rim is computed and subtracted first:
 
     E[p] = sum over q beyond the rim of h[p - q] u[q]             Eq. (1)
     y'[p] = (y[p] / a[p] - E[p]) b[p]                             Eq. (2)
@@ -12,8 +12,8 @@ iteration of van Cittert, u <- max(0, u + y / a - H u). The box and the rim y' a
 
 A linear method converges to H x = y, so a = b = 1. The published step of Richardson-Lucy does not. It conserves the
 flux, and it compensates for light that leaves a plane with the factor r of H^T r = 1 (see `methods.richardson_lucy`):
-it converges to H x = y / r. So a is r on the plane of the whole image, and b is r on the plane of box and rim. With these
-factors, both deconvolutions converge to the same scene.
+it converges to H x = y / r. So a is r on the plane of the whole image, and b is r on the plane of box and rim. With
+these factors, both deconvolutions converge to the same scene.
 
 The difference between the box alone and the same box of the whole image is estimated by
 
@@ -81,9 +81,10 @@ class Options(Conditions):
     """How an image is deconvolved.
 
     method: name of the method; parameters: its own parameters, such as steps and stop. error_draws: number of noise
-    realisations (2 to 64) for the planes of errors; 0: no such planes. region: deconvolve only this box of the image, with a
-    rim that is so wide that the bound of its error is at most `region_error`, a share of the mean light of the box.
-    Raises DataError "bad-draws", "bad-margin", "region-errors", "unknown-method", and the errors of `Method.complete`.
+    realisations (2 to 64) for the planes of errors; 0: no such planes. region: deconvolve only this box of the image,
+    with a rim that is so wide that the bound of its error is at most `region_error`, a share of the mean light of the
+    box. Raises DataError "bad-draws", "bad-margin", "region-errors", "unknown-method", and the errors of
+    `Method.complete`.
     """
 
     method: str = "richardson-lucy"
@@ -197,10 +198,11 @@ class Work:
 class BoxWork:
     """The deconvolution of a box. `run` and `assess` correspond to those of `Work`.
 
-    image: the box, as it was observed; its header has the coordinates of the box. work: the deconvolution of box and rim.
-    box, rim: the box, and the box with its rim, in the pixels of the whole image. shape: (ny, nx) of the whole image.
-    edges: the assumption about the scene beyond the whole image. of_mask: QUALITY of the box that
-    follows from the mask of box and rim. noise: noise of the camera, if known. error: Eq. (3), in the unit of the image; 0 if the rim is the whole image.
+    image: the box, as it was observed; its header has the coordinates of the box. work: the deconvolution of box and
+    rim. box, rim: the box, and the box with its rim, in the pixels of the whole image. shape: (ny, nx) of the whole
+    image. edges: the assumption about the scene beyond the whole image. of_mask: QUALITY of the box that follows from
+    the mask of box and rim. noise: noise of the camera, if known. error: Eq. (3), in the unit of the image; 0 if the
+    rim is the whole image.
     """
 
     image: Image
@@ -266,8 +268,8 @@ class BoxWork:
 def box_work(work: Work, box: Box) -> BoxWork:
     """Prepare the deconvolution of a box: choose the rim, and subtract the light from beyond the rim.
 
-    work: the deconvolution of the whole image. The rim is the narrowest one whose bound is at most the option `region_error`,
-    as a share of the mean light of the box, or the whole image if no rim is wide enough.
+    work: the deconvolution of the whole image. The rim is the narrowest one whose bound is at most the option
+    `region_error`, as a share of the mean light of the box, or the whole image if no rim is wide enough.
 
     Raises DataError "region-outside", "region-too-small", "bad-region-error", "region-discrepancy", "all-masked", and
     "plate-scale-mismatch".
@@ -343,7 +345,9 @@ def _part(image: Image, box: Box, pixels: Plane) -> Image:
 
 @dataclass(frozen=True, eq=False)
 class _Light:
-    """Values for box and rim, [y, x]: E of Eq. (1), 1 / a and 1 / b of Eq. (2); and the bound of the error in the box."""
+    """Values for box and rim, [y, x]: E of Eq. (1), 1 / a and 1 / b of Eq. (2); and the bound of the error in the
+    box.
+    """
 
     light: Plane
     kept: Plane | float
@@ -394,7 +398,7 @@ class _FarLight:
 
 
 def _compensation(convolver: Convolver, shape: tuple[int, int]) -> Plane:
-    """r of H^T r = 1, by the iteration of van Cittert."""
+    """R of H^T r = 1, by the iteration of van Cittert."""
     ones = np.ones(shape)
     ratio = ones
     for _ in range(_ITERATIONS):

@@ -1,18 +1,17 @@
 """The diffraction of a whole telescope: entrance pupil and filter-wheel meshes, component by component.
 
-Hofmeister et al., The point-spread function of HRI_EUV, section "Implementation", the simplified-combined
-solution. The pattern of the entrance pupil (aperture, mount and entrance mesh in one mask) is a Fraunhofer transform; the
-pattern of the filter-wheel mesh is an analytic series. Both patterns are convolved with each other. The patterns of the
-spectral lines of the bandpass are multiplied by the weights of the lines and added.
+Hofmeister et al., The point-spread function of HRI_EUV, section "Implementation", the simplified-combined solution. The
+pattern of the entrance pupil (aperture, mount and entrance mesh in one mask) is a Fraunhofer transform; the pattern of
+the filter-wheel mesh is an analytic series. Both patterns are convolved with each other. The patterns of the spectral
+lines of the bandpass are multiplied by the weights of the lines and added.
 
 One rule decides how each component of the entrance is computed, and the provenance records the decision:
 
 - The mask is transformed if at most 32 samples per pixel are needed (fraunhofer, Eq. (3)). Otherwise the pattern of
   the aperture is analytic (an Airy pattern, or that of the edges of a sector or polygon), and a mount is left out.
-- The transformed mask contains the entrance meshes if all of them are square, cover the whole pupil and are parallel to the
-  pixels.
-  Otherwise each mesh is an analytic series, rotated by the angle of the mesh. The series of meshes side by side are
-  multiplied by their shares and added. The result is convolved with the pattern of the aperture and its mount.
+- The transformed mask contains the entrance meshes if all of them are square, cover the whole pupil and are parallel to
+  the pixels. Otherwise each mesh is an analytic series, rotated by the angle of the mesh. The series of meshes side by
+  side are multiplied by their shares and added. The result is convolved with the pattern of the aperture and its mount.
 
 | symbol | name |
 |---|---|
@@ -51,7 +50,8 @@ FILTER_WHEEL, DIFFRACTION = "FILTER_WHEEL", "DIFFRACTION"
 @dataclass(frozen=True)
 class Route:
     """Which components of the entrance the transformed mask contains. str() gives this decision and the reason for
-    it."""
+    it.
+    """
 
     samples: int
     mask: bool
@@ -114,7 +114,9 @@ def available_parts(instrument: Instrument) -> tuple[str, ...]:
 
 
 def needed_parts(names: Iterable[str], available: Iterable[str], *, meshes_in_mask: bool) -> set[str]:
-    """The components that must be computed to obtain those of these names. available: all components of the instrument."""
+    """The components that must be computed to obtain those of these names. available: all components of the
+    instrument.
+    """
     needed, there = set(names), set(available)
     if DIFFRACTION in needed:
         needed |= {ENTRANCE, FILTER_WHEEL} & there
@@ -136,8 +138,8 @@ def diffraction_patterns(
 ) -> Patterns:
     """Compute the components of these names, shape (size, size), not normalised.
 
-    The patterns of the spectral lines are multiplied by the weights of the lines and added. mount_image: pixels [y, x] of
-    the mount's mask image, if the instrument has one. progress: called with (done, of).
+    The patterns of the spectral lines are multiplied by the weights of the lines and added. mount_image: pixels [y, x]
+    of the mount's mask image, if the instrument has one. progress: called with (done, of).
     """
     route, available = route_of(instrument), available_parts(instrument)
     needed = needed_parts(names, available, meshes_in_mask=route.meshes_in_mask)
@@ -159,9 +161,8 @@ def diffraction_patterns(
             work.kernels[name] = work.kernel(name, report)
             report(1, 1)
             before += STEPS_A_PUPIL
-        for name, kernel in work.kernels.items():
-            if len(lines) > 1:
-                kernel = line.weight * kernel
+        for name, one in work.kernels.items():
+            kernel = line.weight * one if len(lines) > 1 else one
             patterns.kernels[name] = patterns.kernels[name] + kernel if name in patterns.kernels else kernel
     return patterns
 

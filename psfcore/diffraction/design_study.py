@@ -67,7 +67,8 @@ class MeshDesign:
 @dataclass(frozen=True)
 class DesignStudy:
     """The computed meshes, sorted by wire width and then by pitch; and the mesh of the instrument itself ("flown"; None
-    if the instrument has no mesh)."""
+    if the instrument has no mesh).
+    """
 
     instrument: str
     flare_px: int
@@ -82,10 +83,11 @@ class DesignStudy:
 def design_study(
     instrument: Instrument, pitches_um: Iterable[float], wires_um: Iterable[float]
 ) -> DesignStudy:
-    """Compute every combination of pitch and wire at the entrance of `instrument`, and also the first square entrance mesh
-    of the instrument.
+    """Compute every combination of pitch and wire at the entrance of `instrument`, and also the first square entrance
+    mesh of the instrument.
 
-    Raises DataError "bad-design" for no mesh or more than 400 meshes, and for a wire that is not narrower than every pitch.
+    Raises DataError "bad-design" for no mesh or more than 400 meshes, and for a wire that is not narrower than every
+    pitch.
     """
     pitches, wires = sorted(set(pitches_um)), sorted(set(wires_um))
     _check(pitches, wires)
@@ -158,5 +160,6 @@ def _over_scatter(open_share: float, spacing_px: float, halo: NDArray[np.float64
     k = np.arange(np.ceil(_COMPARED_PX[0] / spacing_px), np.floor(_COMPARED_PX[1] / spacing_px) + 1)
     share = open_share**2 * np.sinc(k * open_share) ** 2  # Eq. (1)
     under = halo[np.rint(k * spacing_px).astype(int)]
-    # The light of an order spreads over as many pixels as the flare has. In these pixels the scatter is nearly constant.
+    # The light of an order spreads over as many pixels as the flare has. In these pixels the scatter is nearly
+    # constant.
     return float((share / FLARE_PX**2 / under).max(initial=0.0))

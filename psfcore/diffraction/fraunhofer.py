@@ -71,8 +71,8 @@ Progress = Callable[[int, int], None]
 class FarField:
     """Share of the pupil's light in each pixel [y, x], centre at [n // 2, n // 2], and how it was computed.
 
-    open_area_mm2: the open area of the pupil. samples: S of Eq. (3). symmetry: "none", "mirror" or "mirror and transpose".
-    The pattern sums to less than 1: the remaining light is beyond the grid.
+    open_area_mm2: the open area of the pupil. samples: S of Eq. (3). symmetry: "none", "mirror" or "mirror and
+    transpose". The pattern sums to less than 1: the remaining light is beyond the grid.
     """
 
     pattern: NDArray[np.float64]
@@ -239,7 +239,8 @@ class _Transforms:
     def _phases(self, offset: float) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
         """exp(-2 pi i turns (m + k n) / n) as a product of two factors: the first for each m, the second for each k.
 
-        turns: o_s - n // 2. Because of the term n // 2, the centre of the pattern is at [n // 2], and no shift is needed.
+        turns: o_s - n // 2. Because of the term n // 2, the centre of the pattern is at [n // 2], and no shift is
+        needed.
         """
         turns, n = offset - self.period // 2, self.period
         within = np.exp(-2j * np.pi * turns * np.arange(n) / n)

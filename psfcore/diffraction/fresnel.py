@@ -101,7 +101,9 @@ def grid_for(
 
 
 class FresnelStep:
-    """Propagation through free space between two grids, Eq. (1): prepared once, then applied to any number of fields."""
+    """Propagation through free space between two grids, Eq. (1): prepared once, then applied to any number of
+    fields.
+    """
 
     def __init__(self, source: Grid, target: Grid, distance_mm: float) -> None:
         reach_mm2 = source.wavelength_mm * distance_mm

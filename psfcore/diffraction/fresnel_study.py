@@ -88,8 +88,8 @@ class DistanceResult:
 
     Lines have shape (2 REACH_PX + 1,), sum 1 and their centre at [REACH_PX]. Curves are given at FresnelStudy.radii_px:
     1 - encircled energy in percent, and differences (Fresnel minus combined) in percentage points. difference_points is
-    the difference for the mean over phases; phase_lowest_points and phase_highest_points are the range of the differences
-    for single phases.
+    the difference for the mean over phases; phase_lowest_points and phase_highest_points are the range of the
+    differences for single phases.
     """
 
     distance_mm: float
@@ -160,10 +160,9 @@ def fresnel_study(
 ) -> FresnelStudy:
     """Compare the methods with the filter wheel at each distance (mm) from the detector.
 
-    phases: number of positions of the filter-wheel mesh, equally spaced over its pitch. windows: number of windows of the
-    analytic series; default: the number in the instrument file. progress: called with (done, of).
-    Raises DataError "bad-instrument-file", "no-focus", "bad-distance", "bad-phases", "bad-windows" or
-    "too-many-samples".
+    phases: number of positions of the filter-wheel mesh, equally spaced over its pitch. windows: number of windows of
+    the analytic series; default: the number in the instrument file. progress: called with (done, of). Raises DataError
+    "bad-instrument-file", "no-focus", "bad-distance", "bad-phases", "bad-windows" or "too-many-samples".
     """
     path = light_path(instrument)
     windows = path.wheel_mesh.windows if windows is None else windows
@@ -204,7 +203,8 @@ def fresnel_study(
 
 class _AtWheel:
     """The focused wave in front of the filter wheel, and its propagation through the mesh of the wheel to the
-    detector."""
+    detector.
+    """
 
     def __init__(self, path: LightPath, at_primary: Wave, separation_mm: float, distance_mm: float) -> None:
         self.path, self.distance_mm = path, distance_mm

@@ -6,10 +6,10 @@ enters parallel to the axis at height 1. The mirrors are thin: f = R / 2 for a c
 
     y2 = 1 - s / f1,   u2 = -1 / f1 - y2 / f2,   y(z) = y2 + z u2,   focal length = -1 / u2        Eq. (1)
 
-The paper's section "The instrument" prints radii and distances that are not consistent: with them the detector is far out
-of focus. `best_focus` solves for the separation of the mirrors. The focus is most sensitive to this length, because the
-secondary magnifies an error of this length. All other lengths keep their printed values, and the result states by how much
-the separation was shifted. Rays near the axis meet on the detector where y(L) = 0:
+The paper's section "The instrument" prints radii and distances that are not consistent: with them the detector is far
+out of focus. `best_focus` solves for the separation of the mirrors. The focus is most sensitive to this length, because
+the secondary magnifies an error of this length. All other lengths keep their printed values, and the result states by
+how much the separation was shifted. Rays near the axis meet on the detector where y(L) = 0:
 
     s = f1 - L / (1 - L / f2)                                                                      Eq. (2)
 
@@ -149,7 +149,9 @@ class Waves:
         self._behind = FresnelStep(self.secondary, plane, distance_mm)
 
     def at_primary(self, openings_mm: Vector) -> Wave:
-        """The field behind the primary, for a plane wave along the axis. The light that enters through the openings is 1."""
+        """The field behind the primary, for a plane wave along the axis. The light that enters through the openings is
+        1.
+        """
         field = open_share(self.aperture, openings_mm).astype(np.complex128)
         field /= np.sqrt(self.aperture.light(field))
         field = FresnelStep(self.aperture, self.primary, self.path.aperture_to_primary_mm).apply(field)
@@ -276,8 +278,8 @@ def paraxial_separation_mm(path: LightPath) -> float:
 def best_focus(waves: Waves, *, nominal_focal_length_mm: float) -> BestFocus:
     """Solve for the separation of best focus.
 
-    waves: those of `waves_to_detector`. nominal_focal_length_mm: the focal length of the instrument file, for comparison.
-    Raises DataError "no-focus" if there is no maximum within SEARCH_MM of the paraxial separation.
+    waves: those of `waves_to_detector`. nominal_focal_length_mm: the focal length of the instrument file, for
+    comparison. Raises DataError "no-focus" if there is no maximum within SEARCH_MM of the paraxial separation.
     """
     path = waves.path
     at_primary = waves.at_primary(path.aperture_mm)
@@ -327,7 +329,8 @@ def _sharpest(waves: Waves, at_primary: Wave, paraxial_mm: float) -> float:
     if abs(separation_mm - paraxial_mm) > 0.95 * SEARCH_MM:
         raise DataError(
             "no-focus",
-            f"expected best focus within {SEARCH_MM} mm of the paraxial separation {paraxial_mm:.3f} mm; got no maximum "
+            f"expected best focus within {SEARCH_MM} mm of the paraxial separation {paraxial_mm:.3f} mm; got no "
+            "maximum "
             "there: correct the radii or distances of the mirrors in the instrument file",
         )
     return separation_mm

@@ -21,22 +21,22 @@ of every pair of cells is distributed over the pixels that the pair covers. The 
 (The transform of the envelope is a triangle. Only the term m = 0 of the cosine series lies within its support.) The
 weights are fractions of the light on the whole plane, so light outside the array is missing from the sum.
 
-A mesh with hexagonal openings (a honeycomb): Goodman, Introduction to Fourier Optics, section "Gratings": the pattern of a
-periodic mask consists of orders at the vectors g of the reciprocal lattice. With openings at distances d from their six
-neighbours and F the transform of one opening, the share of the transmitted light in an order is
+A mesh with hexagonal openings (a honeycomb): Goodman, Introduction to Fourier Optics, section "Gratings": the pattern
+of a periodic mask consists of orders at the vectors g of the reciprocal lattice. With openings at distances d from
+their six neighbours and F the transform of one opening, the share of the transmitted light in an order is
 
     light(g) = |F(g)|^2 / (A B),   A = sqrt(3) w^2 / 2,   B = sqrt(3) d^2 / 2                          Eq. (6)
     g = (h (1, -1 / sqrt(3)) + k (0, 2 / sqrt(3))) / d                                              Eq. (7)
 
-in the frame of the mesh, whose x axis points from an opening to the next; h and k are whole numbers. The six nearest orders
-are 2 / (sqrt(3) d) from the centre, at angles of 60 degrees, beginning at 30 degrees. The opening consists of three
-rhombi that meet in its centre, with sides v and u, two corners of the hexagon that are 120 degrees apart:
+in the frame of the mesh, whose x axis points from an opening to the next; h and k are whole numbers. The six nearest
+orders are 2 / (sqrt(3) d) from the centre, at angles of 60 degrees, beginning at 30 degrees. The opening consists of
+three rhombi that meet in its centre, with sides v and u, two corners of the hexagon that are 120 degrees apart:
 
     F(g) = sum over the rhombi of |v x u| sinc(pi g.v) sinc(pi g.u) cos(pi g.(v + u))                  Eq. (8)
 
-By Parseval's theorem the shares sum to 1, and order 0 has the open share A / B = (w / d)^2. On the detector, the order g is at
-lambda z g. Its light is spread over a small square as wide as an order of so many windows; the pattern of the aperture
-widens it further.
+By Parseval's theorem the shares sum to 1, and order 0 has the open share A / B = (w / d)^2. On the detector, the order
+g is at lambda z g. Its light is spread over a small square as wide as an order of so many windows; the pattern of the
+aperture widens it further.
 
 | symbol | name | unit |
 |---|---|---|
@@ -120,8 +120,8 @@ def _cells(
     """Divide one axis of the pattern, from -reach_px to reach_px, into cells; return the middle (px), width (px) and
     light of each cell.
 
-    The light of a cell is a fraction of the light on the whole axis. A cell is a part of a lobe of the grating factor, a
-    whole lobe, or, where there is little light, several lobes. The middle of a cell is the centroid of its light.
+    The light of a cell is a fraction of the light on the whole axis. A cell is a part of a lobe of the grating factor,
+    a whole lobe, or, where there is little light, several lobes. The middle of a cell is the centroid of its light.
     """
     lobe_px = spacing_px / windows
     parts = max(1, int(np.ceil(lobe_px / FINEST_CELL_PX)))

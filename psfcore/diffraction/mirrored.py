@@ -13,8 +13,8 @@ The result is real, so one complex transform serves two rows: with f = f_A + i f
 only a quarter of the mask is needed, and along y half of its rows. In comparison with the complex sum of
 `fraunhofer`, half as many transforms are computed, from half as many cells.
 
-The data have the layout of `psfcore.convolution.engine`: [index][half][lane]. The two halves are the rows A and B of one
-transform, and sixteen transforms ("lanes") are computed side by side in the cache.
+The data have the layout of `psfcore.convolution.engine`: [index][half][lane]. The two halves are the rows A and B of
+one transform, and sixteen transforms ("lanes") are computed side by side in the cache.
 
 | symbol | name | unit |
 |---|---|---|
@@ -163,7 +163,8 @@ class MirroredTransforms:
 @dataclass(frozen=True, eq=False)
 class _Buffers:
     """Working memory of one thread: rows of the mask, their layout in lanes, a transform, and a small array in which
-    blocks are transposed."""
+    blocks are transposed.
+    """
 
     strip: Single
     lanes: Single

@@ -1,7 +1,7 @@
 """Diffraction by an open aperture, integrated over detector pixels, where its mask would need too many samples.
 
-`airy_kernel`, for a disc or ring: the Airy pattern (Goodman, Introduction to Fourier Optics, section "Fresnel and Fraunhofer
-diffraction"), with e the obscured fraction of the diameter and v = pi D r / (lambda f):
+`airy_kernel`, for a disc or ring: the Airy pattern (Goodman, Introduction to Fourier Optics, section "Fresnel and
+Fraunhofer diffraction"), with e the obscured fraction of the diameter and v = pi D r / (lambda f):
 
     U(v) = (2 J1(v) / v - e^2 2 J1(e v) / (e v)) / (1 - e^2)                                     Eq. (1)
     dB/dv = -(1 - e^2) v U(v)^2 / 2;   for a disc B = J0(v)^2 + J1(v)^2                          Eq. (2)
@@ -22,9 +22,9 @@ directions of its radii. On a line from the centre along the normal, to both sid
     an arc is a fan of such lines, each with L = R d(angle)                                           Eq. (5)
     light in the central pixel = 1 - all other light
 
-Eq. (4) follows from the transform of a half-plane, 1 / (2 pi i q): its square, summed along the edge (Parseval), is
-L / (4 pi^2 q^2), with q = x p / (lambda f). For a whole disc, the sum over all directions is 2 / (pi v), which is the mean of
-B of Eq. (2) for large v. The line of a straight edge is lambda f / (L p) pixels wide; here it is infinitely thin. An
+Eq. (4) follows from the transform of a half-plane, 1 / (2 pi i q): its square, summed along the edge (Parseval), is L /
+(4 pi^2 q^2), with q = x p / (lambda f). For a whole disc, the sum over all directions is 2 / (pi v), which is the mean
+of B of Eq. (2) for large v. The line of a straight edge is lambda f / (L p) pixels wide; here it is infinitely thin. An
 edge must therefore be longer than lambda f / p.
 
 | symbol | name | unit |
@@ -172,7 +172,9 @@ def _edges(aperture: Aperture) -> tuple[Vector, Vector, float]:
 
 @compiled()
 def _cast(kernel, cosines, sines, weights):  # type: ignore[no-untyped-def]
-    """Move the light of each line, Eq. (4), from the central pixel to the pixels that the line crosses, on both sides."""
+    """Move the light of each line, Eq. (4), from the central pixel to the pixels that the line crosses, on both
+    sides.
+    """
     size = kernel.shape[0]
     half = size // 2
     for n in range(len(weights)):

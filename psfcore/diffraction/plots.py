@@ -40,7 +40,8 @@ def fresnel_png(study: FresnelStudy, path: str | Path) -> None:
     )
     focus = study.focus
     below = (
-        f"best focus: mirror separation {focus.separation_mm:.2f} mm ({focus.shift_mm:+.2f} mm from the printed value), "
+        f"best focus: mirror separation {focus.separation_mm:.2f} mm ({focus.shift_mm:+.2f} mm from the printed "
+        "value), "
         f"focal length {focus.focal_length_mm:.0f} mm; mean of {study.phases} mesh phases; "
         f"series of {study.windows} windows"
     )

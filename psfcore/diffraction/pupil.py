@@ -126,7 +126,9 @@ def circle(radius_mm: float) -> Corners:
 
 
 def bar(start_mm: float, end_mm: float, width_mm: float, angle_deg: float) -> Corners:
-    """Corners (4, 2) in mm of a bar from start_mm to end_mm along the direction `angle_deg` through the optical axis."""
+    """Corners (4, 2) in mm of a bar from start_mm to end_mm along the direction `angle_deg` through the optical
+    axis.
+    """
     half_mm = width_mm / 2
     corners = np.array([(start_mm, -half_mm), (end_mm, -half_mm), (end_mm, half_mm), (start_mm, half_mm)])
     cos, sin = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
@@ -209,7 +211,9 @@ class MaskGrid:
         self._picture = pupil.picture
 
     def rows(self, first: int, stop: int, out: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
-        """The open shares of the rows `first` to `stop` - 1, shape (stop - first, cells), written to `out` if it is given."""
+        """The open shares of the rows `first` to `stop` - 1, shape (stop - first, cells), written to `out` if it is
+        given.
+        """
         strip = np.empty((stop - first, self.cells), dtype=np.float32) if out is None else out[: stop - first]
         most = int(np.diff(self._first_entry[first : stop + 1]).max(initial=1))
         _cover(
@@ -229,7 +233,9 @@ class MaskGrid:
         return strip
 
     def _in_cells(self, outlines: tuple[Outline, ...]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """All edges (x0, y0, x1, y1), measured in cells from the lower left corner of the mask, and the outline of each edge."""
+        """All edges (x0, y0, x1, y1), measured in cells from the lower left corner of the mask, and the outline of each
+        edge.
+        """
         edges, owners = [], []
         for owner, outline in enumerate(outlines):
             for corners in outline:
@@ -268,8 +274,8 @@ def _cover(strip, area, ranges, first_row, line, edges, outline_of_edge, first_e
     """Write the open share of each cell into `strip`.
 
     The open share of a cell is the product of its open shares in the meshes, in the opening (outline 0) and in all
-    other outlines. area: zeros, two more than a row has cells; ranges: room for the ranges of cells that the edges of an
-    outline cross in a row.
+    other outlines. area: zeros, two more than a row has cells; ranges: room for the ranges of cells that the edges of
+    an outline cross in a row.
     """
     rows, cells = strip.shape
     begins, ends = ranges[0], ranges[1]

@@ -38,8 +38,8 @@ _FIGURE = re.compile(r'(?<=src=")figure:(\d+)')
 class Page:
     """A page. html: the whole page in one file.
 
-    For other pages that show the same: texts: the title, the lead and the footer as text, and the sections as HTML, in which
-    ``figure:N`` is the address of the figure N. figures: PNG, in reading order, from N = 1.
+    For other pages that show the same: texts: the title, the lead and the footer as text, and the sections as HTML, in
+    which ``figure:N`` is the address of the figure N. figures: PNG, in reading order, from N = 1.
     """
 
     html: str
@@ -107,7 +107,7 @@ def prose(text: str) -> Markup:
     """The text in one line, with no line break between a number and its error or its percent sign."""
     space = "\N{NO-BREAK SPACE}"
     line = _SPACES.sub(" ", str(escape(text))).strip()
-    return Markup(line.replace(" ± ", f"{space}±{space}").replace(" %", f"{space}%"))
+    return Markup(line.replace(" ± ", f"{space}±{space}").replace(" %", f"{space}%"))  # noqa: S704  # escaped above
 
 
 @cache

@@ -1,4 +1,5 @@
-"""Plots of an image before and after deconvolution and of a PSF, and the parts that the charts of fits and evaluations share.
+"""Plots of an image before and after deconvolution and of a PSF, and the parts that the charts of fits and evaluations
+share.
 
 Each plot has its own figure on the Agg canvas, so threads share no state. pyplot would keep a state that they share.
 """
@@ -131,7 +132,9 @@ def preview_figure(before: Plane, after: Plane, *, title: str, unit: str) -> Fig
 
 
 def compared_panels(before: Plane, after: Plane, unit: str) -> list[Panel]:
-    """The panels of an image before and after (same stretch), and of the change in percent; each at most PANEL_PX wide."""
+    """The panels of an image before and after (same stretch), and of the change in percent; each at most PANEL_PX
+    wide.
+    """
     step = max(1, -(-max(before.shape) // PANEL_PX))
     before, after = binned(before, step), binned(after, step)
     stretch = square_root_stretch(before, after)
@@ -269,6 +272,7 @@ def change_pct(before: Plane, after: Plane) -> NDArray[np.float64]:
 
 
 def colourbar(figure: Figure, axes: Axes, drawn: ScalarMappable, *, beyond: str) -> None:
+    """Draw the bar of colours of a map at the right of its axes. beyond: see `Figure.colorbar`, extend."""
     box = axes.get_position()
     width = 0.0085
     bar_axes = figure.add_axes((box.x1 + 0.006, box.y0, width, box.height))
@@ -348,8 +352,8 @@ def draw_weights_of_shells(
 ) -> None:
     """Draw the weights of the free shells that begin within the field as steps: medians, bands of 1 and 2 sigma.
 
-    No pixel constrains the other shells. limits: as for `draw_band`, one column for each shell. The axis is logarithmic,
-    so weights of 0 are drawn as very small ones.
+    No pixel constrains the other shells. limits: as for `draw_band`, one column for each shell. The axis is
+    logarithmic, so weights of 0 are drawn as very small ones.
     """
     shown = edges_px[:-1] < field_px
     edges = edges_px[: np.count_nonzero(shown) + 1]

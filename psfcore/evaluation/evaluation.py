@@ -10,21 +10,21 @@ H is the convolution with a total PSF on the field, y is an image, and D selects
 
 PE is the percentage error of a pixel. Differences from the paper:
 
-- In the paper's formula, the PE is divided by the sum over the occulted pixels. The paper's text and figures require the
-  mean, so the mean is used here.
+- In the paper's formula, the PE is divided by the sum over the occulted pixels. The paper's text and figures require
+  the mean, so the mean is used here.
 - Only fully dark pixels are set to zero. The scene is reconstructed by a linear method.
-- The residual at the centre is the mean PE within CENTRE_PX, so it is also divided by the mean of the whole disc. The mean
-  of the centre alone is the mean of a dozen pixels with a dozen photons each. This mean would be too noisy as a
+- The residual at the centre is the mean PE within CENTRE_PX, so it is also divided by the mean of the whole disc. The
+  mean of the centre alone is the mean of a dozen pixels with a dozen photons each. This mean would be too noisy as a
   denominator and would bias the residual high.
 
 Errors contain the photon and read noise of the image, propagated through Eq. (1). They do not contain the error of the
-PSF. Errors of means are exact (`noise_covariance`). Errors of single pixels come from noise realisations. The variance of
-the noise in a realisation follows from the observed intensity, but in the pixels of D from the simulated intensity.
+PSF. Errors of means are exact (`noise_covariance`). Errors of single pixels come from noise realisations. The variance
+of the noise in a realisation follows from the observed intensity, but in the pixels of D from the simulated intensity.
 
-MPE and MAPE are maps by position in the occulter. The discs are aligned to the nearest whole pixel. The alignment does not
-interpolate, so it does not change the noise. It blurs positions by up to half a pixel along each axis. The same maps are
-computed from noise realisations, for comparison. The absolute value of noise does not average to zero, so the MAPE can only
-be interpreted relative to the MAPE of noise alone.
+MPE and MAPE are maps by position in the occulter. The discs are aligned to the nearest whole pixel. The alignment does
+not interpolate, so it does not change the noise. It blurs positions by up to half a pixel along each axis. The same
+maps are computed from noise realisations, for comparison. The absolute value of noise does not average to zero, so the
+MAPE can only be interpreted relative to the MAPE of noise alone.
 
 | symbol | name | unit |
 |---|---|---|
@@ -132,7 +132,9 @@ class FrameEvaluation:
 
     @property
     def centre_dn_s(self) -> tuple[float, float]:
-        """The mean observed and mean simulated intensity at the centre; nan if there are no dark pixels at the centre."""
+        """The mean observed and mean simulated intensity at the centre; nan if there are no dark pixels at the
+        centre.
+        """
         at = at_centre(self.dark, self.found)
         if not at.any():
             return float("nan"), float("nan")
@@ -303,7 +305,8 @@ def evaluate(
         reasons = "; ".join(f"{file}: {why}" for file, why in list(left_out.items())[:3])
         raise DataError(
             "no-occulter",
-            f"expected at least one image with a usable occulter; got none ({reasons}): check the positions in transit.json",
+            f"expected at least one image with a usable occulter; got none ({reasons}): check the positions in "
+            "transit.json",
         )
     order = sorted(done)
     frames = tuple(done[n] for n in order)
@@ -348,7 +351,7 @@ class _FrameSimulator:
         return found, dark_pixels(frames[n], found)
 
     def simulated(self, n: int, dark: Pixels) -> NDArray[np.float32]:
-        """s of Eq. (1), [y, x]."""
+        """S of Eq. (1), [y, x]."""
         scene = self.scene_of(n).copy()
         scene[dark] = 0.0
         return self.optics.field(self.optics.convolve(self.optics.lanes(scene)))

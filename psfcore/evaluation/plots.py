@@ -83,7 +83,9 @@ def shown_slices(evaluation: Evaluation, most: int) -> list[FrameEvaluation]:
 
 
 def draw_slices(charts: Sequence[Any], frames: Sequence[FrameEvaluation], letters: float) -> None:
-    """Draw the slices of each image on a chart, with a legend whose letters have this size. Hide the charts that are left."""
+    """Draw the slices of each image on a chart, with a legend whose letters have this size. Hide the charts that are
+    left.
+    """
     for axes, frame in zip(charts, frames, strict=False):
         _draw_slices(axes, frame)
         boxed_legend(axes, letters, "upper center")

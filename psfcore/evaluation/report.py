@@ -6,8 +6,8 @@ Hofmeister et al., The point-spread function of HRI_EUV, section "Evaluation".
     error of the slope = (sum w (u - <u>)^2)^(-1/2) max(1, chi2 / (N - 2))^(1/2)                 Eq. (2)
 
 The sums run over the N images of a pointing. If e varies about the fitted line by more than noise explains, Eq. (2)
-increases the error of the slope accordingly. The occulter's x and y change together along its track. Therefore the slopes
-along x and along y, which come from the same images, are not independent.
+increases the error of the slope accordingly. The occulter's x and y change together along its track. Therefore the
+slopes along x and along y, which come from the same images, are not independent.
 
 | symbol | name | unit |
 |---|---|---|
@@ -38,9 +38,9 @@ class Summary:
     """Errors of the images of one pointing. The unit is percent of the observed mean, or the unit in the name of a
     field.
 
-    fov: the pointing; None: all pointings. mean_noise_pct: standard error of the mean from image noise. noise_pct: the rms
-    that image noise alone would cause. gap_pct: the rms with the noise subtracted in quadrature. centre_...: the same
-    quantities for the mean PE at the centre of the disc.
+    fov: the pointing; None: all pointings. mean_noise_pct: standard error of the mean from image noise. noise_pct: the
+    rms that image noise alone would cause. gap_pct: the rms with the noise subtracted in quadrature. centre_...: the
+    same quantities for the mean PE at the centre of the disc.
     """
 
     fov: int | None

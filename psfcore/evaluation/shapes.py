@@ -1,9 +1,10 @@
 """Compare shapes of scatter by their errors on held-out images.
 
-Source: Hofmeister et al., The point-spread function of HRI_EUV, section "Accuracy and robustness". The paper compares three
-shapes by the MPE and MAPE of all superposed occulters: isotropic, stretched along x, and stretched along any direction.
-Free shells are added here. Each shape is fitted to all images. The PSF of a fold differs from this fit by one step (Eq.
-(1) of `psfcore.scatter.validation.cross_validation`). Every image is simulated with the PSF of the fold that holds it out.
+Source: Hofmeister et al., The point-spread function of HRI_EUV, section "Accuracy and robustness". The paper compares
+three shapes by the MPE and MAPE of all superposed occulters: isotropic, stretched along x, and stretched along any
+direction. Free shells are added here. Each shape is fitted to all images. The PSF of a fold differs from this fit by
+one step (Eq. (1) of `psfcore.scatter.validation.cross_validation`). Every image is simulated with the PSF of the fold
+that holds it out.
 
 The errors of the figures below come from a bootstrap of the images. All shapes use the same images, so the differences
 between shapes have much smaller errors than the figures themselves. If the residuals of consecutive images are
@@ -106,7 +107,8 @@ def compare_shapes_by_errors(
     if solution.inversion.shape.name != SOFTENED_POWER_LAW.name:
         raise DataError(
             "unknown-shape",
-            f"expected a fit of the shape {SOFTENED_POWER_LAW.name}; got {solution.inversion.shape.name}: fit that shape first",
+            f"expected a fit of the shape {SOFTENED_POWER_LAW.name}; got {solution.inversion.shape.name}: fit that "
+            "shape first",
         )
     named: dict[str, tuple[Solution | None, KernelOf]] = {
         SOFTENED_POWER_LAW.name: (solution, held_out_kernels(solution))
@@ -157,8 +159,8 @@ def _parameters(inversion: Inversion) -> dict[str, tuple[float, float]]:
 def held_out_kernels(solution: Solution) -> KernelOf:
     """For each image index, the total PSF [y, x] fitted without that image.
 
-    Each fold takes one step from the fit to all images (`psfcore.scatter.validation.cross_validation.shared_step`). Raises
-    DataError "too-few-images" for fewer than six images.
+    Each fold takes one step from the fit to all images (`psfcore.scatter.validation.cross_validation.shared_step`).
+    Raises DataError "too-few-images" for fewer than six images.
     """
     return _of_folds(solution, lambda _, at: solution.total.kernel(at))
 

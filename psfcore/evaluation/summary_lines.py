@@ -20,7 +20,8 @@ def summary_lines(evaluation: Json, shapes: Json | None = None) -> list[str]:
     lines = ["simulated minus observed light in the occulter's disc, in percent of the observed light:"]
     lines += [_pointing(of) for of in (*evaluation["pointings"], evaluation["all"])]
     lines.append(
-        f"errors per pixel of the disc: MPE {_number(maps['mpe_rms_pct'])} % rms, largest {_number(maps['mpe_largest_pct'])} % "
+        f"errors per pixel of the disc: MPE {_number(maps['mpe_rms_pct'])} % rms, largest "
+        f"{_number(maps['mpe_largest_pct'])} % "
         f"(noise alone {_number(maps['mpe_noise_rms_pct'])} % rms); MAPE {_number(maps['mape_mean_pct'])} % "
         f"(noise alone {_number(maps['mape_noise_mean_pct'])} %)"
     )
@@ -37,8 +38,10 @@ def _pointing(of: Json) -> str:
     name = "all pointings" if of["fov"] is None else f"pointing {of['fov']}"
     centre = "" if of["centre_mean_pct"] is None else f"; centre {of['centre_mean_pct']:+.2f} %"
     return (
-        f"{name}: {of['images']} images, mean {_number(of['mean_pct'], '+')} % (noise {_number(of['mean_noise_pct'])}), "
-        f"rms {_number(of['rms_pct'])} % (noise {_number(of['noise_pct'])}), largest {_number(of['largest_pct'])} %{centre}"
+        f"{name}: {of['images']} images, mean {_number(of['mean_pct'], '+')} % (noise "
+        f"{_number(of['mean_noise_pct'])}), "
+        f"rms {_number(of['rms_pct'])} % (noise {_number(of['noise_pct'])}), largest {_number(of['largest_pct'])} "
+        f"%{centre}"
     )
 
 

@@ -5,8 +5,9 @@ Source: FITS standard 4.0 (Pence et al. 2010; IAU FITS working group 2018), sect
 cards NAXISn, BITPIX, PCOUNT and GCOUNT. heliopsf uses the first two-dimensional image of a file: a plain image HDU, or
 a tile-compressed image in a binary table with ZIMAGE = T.
 
-If the whole file is compressed (.fits.gz), it is decompressed first, in a process of its own (`psfcore.fits.gzipped`). The
-headers are read in this process: no C library reads them, their size is limited, and a child would add some milliseconds to each.
+If the whole file is compressed (.fits.gz), it is decompressed first, in a process of its own (`psfcore.fits.gzipped`).
+The headers are read in this process: no C library reads them, their size is limited, and a child would add some
+milliseconds to each.
 """
 
 from __future__ import annotations
@@ -117,7 +118,8 @@ class Hdu:
         check_header(
             size <= LARGEST_COUNT,
             "bad-card",
-            f"expected a data size below 2^63 bytes in HDU {self.number}; its header declares about 2^{size.bit_length()} bytes: copy or "
+            f"expected a data size below 2^63 bytes in HDU {self.number}; its header declares about "
+            f"2^{size.bit_length()} bytes: copy or "
             "make the file again",
         )
         return self.start + size
@@ -177,7 +179,8 @@ def open_source(path: Path, limits: FitsLimits) -> Iterator[Source]:
 
 
 def walk(source: Source, limits: FitsLimits) -> Iterator[Hdu]:
-    """Each HDU of a file. Its data come next in ``source``; what is left of them is skipped when the next HDU is requested.
+    """Each HDU of a file. Its data come next in ``source``; what is left of them is skipped when the next HDU is
+    requested.
 
     Raises HeaderError.
     """
@@ -189,7 +192,8 @@ def walk(source: Source, limits: FitsLimits) -> Iterator[Hdu]:
         check_header(
             number < limits.max_hdus,
             "too-many-hdus",
-            f"expected at most {limits.max_hdus} HDUs, and an image in one of them; got more HDUs: write the image into a "
+            f"expected at most {limits.max_hdus} HDUs, and an image in one of them; got more HDUs: write the image "
+            "into a "
             "file of its own",
         )
         header_bytes += len(raw)
@@ -243,7 +247,8 @@ def _no_image(kinds: list[str]) -> HeaderError:
         first = ", ".join("0" * (axes - 2)) if axes < _MANY_AXES else "..."
         return HeaderError(
             "three-axes" if axes == 3 else "not-2d",
-            f"{expected}; got an image of {axes} axes in HDU {hdu}: name another HDU (--hdu), or write one plane, for example with astropy: "
+            f"{expected}; got an image of {axes} axes in HDU {hdu}: name another HDU (--hdu), or write one plane, for "
+            "example with astropy: "
             f"hdus = fits.open('FILE'); hdus[{hdu}].data = hdus[{hdu}].data[{first}]; hdus.writeto('NEW')",
         )
     if "line" in kinds:
@@ -278,7 +283,8 @@ def _read_header(source: Source, most: int, limits: FitsLimits, *, first: bool) 
         )
     raise HeaderError(
         "header-too-long",
-        f"expected at most {limits.max_header_bytes} bytes of headers, each with an END card; got more: write the image "
+        f"expected at most {limits.max_header_bytes} bytes of headers, each with an END card; got more: write the "
+        "image "
         "into a file of its own, with fewer cards",
     )
 

@@ -1,7 +1,7 @@
 """Read single cards of a FITS header: whole numbers, flags and texts.
 
-A card that defines the structure of a file must be correct and occur once. Source: FITS standard 4.0 (Pence et al. 2010;
-IAU FITS working group 2018), section 4.4.
+A card that defines the structure of a file must be correct and occur once. Source: FITS standard 4.0 (Pence et al.
+2010; IAU FITS working group 2018), section 4.4.
 """
 
 from __future__ import annotations
@@ -56,7 +56,9 @@ def check_header(good: bool, code: str, message: str) -> None:
 
 
 def card_value(header: Header, key: str) -> object:
-    """The value of a structural card, or None. Raises HeaderError if the card is unreadable or occurs more than once."""
+    """The value of a structural card, or None. Raises HeaderError if the card is unreadable or occurs more than
+    once.
+    """
     if key not in header:
         return None
     check_card(header.count(key) == 1, f"card {key} once", f"it {header.count(key)} times")
@@ -120,7 +122,9 @@ def long_key(key: str) -> str:
 
 
 def number_of(value: object, *, text: bool = True) -> float | None:
-    """A finite number, as a card, a table in memory or numpy holds it; None for anything else. text: also a number as text."""
+    """A finite number, as a card, a table in memory or numpy holds it; None for anything else. text: also a number as
+    text.
+    """
     if isinstance(value, str):
         value = float(re.sub("[dD]", "e", value)) if text and _NUMBER.fullmatch(value.strip()) else None
     if getattr(value, "mask", False) is not False:  # a masked cell of a table

@@ -114,7 +114,9 @@ def _other_instrument(psf: Origin, header: Cards) -> str | None:
 
 
 def _wavelengths(psf: Origin, header: Cards) -> dict[str, float | None]:
-    """Wavelengths in angstrom of the PSF and the image: as they give it, or else of their instruments; None if neither gives it."""
+    """Wavelengths in angstrom of the PSF and the image: as they give it, or else of their instruments; None if neither
+    gives it.
+    """
     given = {
         "PSF": (psf.wavelength_angstrom, psf.instrument),
         "image": (wavelength_angstrom(header), known_instrument(header)),

@@ -1,10 +1,11 @@
-"""Check the header of a tile-compressed image, before astropy reads its tiles in a process of its own (`psfcore.limited`).
+"""Check the header of a tile-compressed image, before astropy reads its tiles in a process of its own
+(`psfcore.limited`).
 
 Source: FITS standard 4.0 (Pence et al. 2010; IAU FITS working group 2018), sections 7.3 and 10.1. The decoders of
 astropy are C functions that trust some cards. With BYTEPIX = 8, the decoder of RICE_1 returns twice the number of bytes
-that it has written. With a large BLOCKSIZE, it reads and writes past its buffers. With dithering and an invalid ZDITHER0,
-astropy reads outside the table of random numbers. The pixels would be wrong without an error, so these cards must have
-values that the standard allows. Other wrong cards make the process of the decoder fail.
+that it has written. With a large BLOCKSIZE, it reads and writes past its buffers. With dithering and an invalid
+ZDITHER0, astropy reads outside the table of random numbers. The pixels would be wrong without an error, so these cards
+must have values that the standard allows. Other wrong cards make the process of the decoder fail.
 
 This module reads no data, so the web process can import it.
 """
@@ -66,7 +67,8 @@ def _check_tiling(header: Header, nx: int, ny: int) -> None:
     check_header(
         1 <= tile_x <= _LARGEST_INT and 1 <= tile_y <= _LARGEST_INT,
         "bad-tiles",
-        f"expected tiles of 1 to {_LARGEST_INT} pixels on each axis; got {tile_x} x {tile_y}: copy or make the file again",
+        f"expected tiles of 1 to {_LARGEST_INT} pixels on each axis; got {tile_x} x {tile_y}: copy or make the file "
+        "again",
     )
     tiles = math.prod(-(-n // tile) for n, tile in ((nx, tile_x), (ny, tile_y)))
     rows = card_count(header, "NAXIS2")

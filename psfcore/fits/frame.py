@@ -1,17 +1,19 @@
 """How the pixels of an image lie on the detector: plate scale, turns and flips, and whether they were interpolated.
 
-World coordinates of a pixel at the offset p from the reference pixel (Greisen and Calabretta 2002, A&A 395, 1061; Thompson
-2006, A&A 449, 791):
+World coordinates of a pixel at the offset p from the reference pixel (Greisen and Calabretta 2002, A&A 395, 1061;
+Thompson 2006, A&A 449, 791):
 
     w = M p,   M_ij = CD_ij, or CDELT_i PC_ij, or CDELT_i R_ij(CROTA2)                    Eq. (1)
 
-A PSF is known on the pixels of the detector. Let M_0 be the matrix of an image as the detector gives it: a turn by the roll
-of the spacecraft, without a flip. Then the offset p on the image is, up to the plate scale, the offset T p on the detector:
+A PSF is known on the pixels of the detector. Let M_0 be the matrix of an image as the detector gives it: a turn by the
+roll of the spacecraft, without a flip. Then the offset p on the image is, up to the plate scale, the offset T p on the
+detector:
 
     T = M_0^-1 M,   both with columns of length 1                                        Eq. (2)
 
-T is the unit matrix for an image as the detector gives it. The roll of M_0 is known where a card states it, although the image
-was turned later: SAT_ROT + INST_ROT of AIA, CROTA of Solar Orbiter, SC_ROLL of STEREO. Other spacecraft keep solar north near +y.
+T is the unit matrix for an image as the detector gives it. The roll of M_0 is known where a card states it, although
+the image was turned later: SAT_ROT + INST_ROT of AIA, CROTA of Solar Orbiter, SC_ROLL of STEREO. Other spacecraft keep
+solar north near +y.
 
 | symbol | name | unit |
 |---|---|---|
@@ -27,7 +29,8 @@ from dataclasses import dataclass
 from psfcore.fits.cards import Cards, optional_number, optional_text
 
 _ARCSEC_PER_UNIT = {"arcsec": 1.0, "arcmin": 60.0, "deg": 3600.0, "degree": 3600.0, "rad": 206264.80624709636}
-# Turns below this angle are not mentioned. Where no card states the roll of the detector, pointing errors are allowed for.
+# Turns below this angle are not mentioned. Where no card states the roll of the detector, pointing errors are allowed
+# for.
 FINEST_ARCSEC = 0.01  # per px; no image of the Sun is finer
 SILENT_DEG = 0.3
 SILENT_WITHOUT_ROLL_DEG = 1.0
@@ -41,8 +44,8 @@ UNIT: Matrix = ((1.0, 0.0), (0.0, 1.0))
 class Frame:
     """How the pixels of an image lie on the detector.
 
-    scale_arcsec: plate scale along x and y, arcsec/px; None: unknown. on_detector: T of Eq. (2). roll_known: whether a card
-    states the roll of the detector. interpolated: why the pixels are not those of the detector; None: they are.
+    scale_arcsec: plate scale along x and y, arcsec/px; None: unknown. on_detector: T of Eq. (2). roll_known: whether a
+    card states the roll of the detector. interpolated: why the pixels are not those of the detector; None: they are.
     """
 
     scale_arcsec: tuple[float | None, float | None]
@@ -52,7 +55,9 @@ class Frame:
 
     @property
     def quarter_turns(self) -> Matrix | None:
-        """The quarter turns and flips of the image, as T with the values -1, 0 and 1; None if it was turned by another angle."""
+        """The quarter turns and flips of the image, as T with the values -1, 0 and 1; None if it was turned by another
+        angle.
+        """
         limit = SILENT_DEG if self.roll_known else SILENT_WITHOUT_ROLL_DEG
         (a, b), (c, d) = self.on_detector
         nearest: Matrix = ((float(round(a)), float(round(b))), (float(round(c)), float(round(d))))
@@ -67,7 +72,9 @@ class Frame:
 
     @property
     def turn_to_build_deg(self) -> float:
-        """The turn (to 0.01 degrees) for which a PSF must be built; 0 if the PSF of the detector can be used, turned or as it is."""
+        """The turn (to 0.01 degrees) for which a PSF must be built; 0 if the PSF of the detector can be used, turned or
+        as it is.
+        """
         return 0.0 if self.flipped or self.quarter_turns is not None else round(self.turn_deg, 2)
 
     @property
@@ -106,13 +113,17 @@ def frame_of(header: Cards) -> Frame:
 
 
 def _unit_without_card(header: Cards, matrix: Matrix) -> str:
-    """The unit of an axis without CUNIT: degrees if the axes are celestial (FITS standard, section 8.2), but many headers mean arcsec."""
+    """The unit of an axis without CUNIT: degrees if the axes are celestial (FITS standard, section 8.2), but many
+    headers mean arcsec.
+    """
     fine = max(abs(one) for row in matrix for one in row) < FINEST_ARCSEC
     return "deg" if fine and (optional_text(header, "CTYPE1") or "")[4:5] == "-" else "arcsec"
 
 
 def plate_scale_arcsec(header: Cards, axis: int = 1) -> float | None:
-    """Plate scale of an axis, arcsec/px; None if the header does not give it in a unit of angle. axis: 1 for x, 2 for y."""
+    """Plate scale of an axis, arcsec/px; None if the header does not give it in a unit of angle. axis: 1 for x, 2 for
+    y.
+    """
     return frame_of(header).scale_arcsec[axis - 1]
 
 

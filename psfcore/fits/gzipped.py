@@ -17,7 +17,8 @@ _PIECE_BYTES = 1 << 20
 
 @contextmanager
 def decompressed(path: Path, most_bytes: int) -> Iterator[tuple[BinaryIO, HeaderError | None]]:
-    """A file without a name that holds the decompressed bytes, and the error of what lacks at its end, if anything does.
+    """A file without a name that holds the decompressed bytes, and the error of what lacks at its end, if anything
+    does.
 
     Codes of the error: "truncated-gzip", "bad-gzip", and "too-many-bytes" beyond ``most_bytes``.
     """

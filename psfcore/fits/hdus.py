@@ -69,8 +69,9 @@ PIXEL_TROUBLE = (
 class StoredImage:
     """Pixels [y, x] (float64) and header of an image, as its file has them, and the number of its HDU.
 
-    bits: BITPIX of the image; None: unknown. others: the number, the name and the shape of each image that follows in the file, if
-    they were asked for; without planes of products. damaged: whether the card DATASUM contradicts the data.
+    bits: BITPIX of the image; None: unknown. others: the number, the name and the shape of each image that follows in
+    the file, if they were asked for; without planes of products. damaged: whether the card DATASUM contradicts the
+    data.
     """
 
     number: int
@@ -82,7 +83,9 @@ class StoredImage:
 
 
 def prepare_library() -> None:
-    """Let astropy write its first file, for which it makes another one to find out whether files can be mapped into memory."""
+    """Let astropy write its first file, for which it makes another one to find out whether files can be mapped into
+    memory.
+    """
     with TemporaryFile() as target:
         fits.HDUList([fits.PrimaryHDU()]).writeto(target)
 
@@ -93,8 +96,8 @@ def read_pixels(
     """Read the first 2-D image of a file, or the image in HDU `hdu`. others: look for further images.
 
     A plain image is read as it stands, in one pass through the file. A tile-compressed image is decoded by astropy in a
-    process of its own, and its header is that of the image. Raises HeaderError, DataError "unreadable-pixels", and OSError
-    if the disk fails.
+    process of its own, and its header is that of the image. Raises HeaderError, DataError "unreadable-pixels", and
+    OSError if the disk fails.
     """
     further: list[tuple[int, str, tuple[int, ...]]] = []
     with open_source(Path(path), limits) as source:
@@ -106,9 +109,11 @@ def read_pixels(
         skip_data(source, image)
         # What follows an image is not needed to use it, so damage there is no error.
         with suppress(HeaderError):
-            for one in hdus if others else ():
-                if one.kind == "image" and not is_plane(one):
-                    further.append((one.number, one.name, shape_of(one.header)))
+            further.extend(
+                (one.number, one.name, shape_of(one.header))
+                for one in (hdus if others else ())
+                if one.kind == "image" and not is_plane(one)
+            )
     if plain is not None:
         return StoredImage(image.number, summary.bitpix, plain, header, further, sums.contradicts(header))
     decoded, damaged = _decoded_pixels(path, summary, twice=may_hold_unwritten_memory(header))
@@ -124,7 +129,9 @@ def read_pixels(
 
 
 class Sum32:
-    """The checksum of data units: the sum of their words of 32 bits in ones' complement. FITS standard 4.0, Appendix J."""
+    """The checksum of data units: the sum of their words of 32 bits in ones' complement. FITS standard 4.0, Appendix
+    J.
+    """
 
     def __init__(self) -> None:
         self._total, self._rest = 0, b""
@@ -146,7 +153,9 @@ class Sum32:
 
 
 def _plain_pixels(source: Source, image: Hdu, summary: HeaderSummary, sums: Sum32) -> NDArray[np.float64]:
-    """The pixels of a plain image, from a source that stands at its data. FITS standard 4.0, Eqs. (3) and (4). sums: gets the bytes."""
+    """The pixels of a plain image, from a source that stands at its data. FITS standard 4.0, Eqs. (3) and (4). sums:
+    gets the bytes.
+    """
     ny, nx = summary.shape
     _ = image.end  # raises the errors of its declared size
     stored = np.dtype(_TYPES[summary.bitpix])
@@ -196,10 +205,11 @@ def _decoded_pixels(
 def decode_tiles(
     target: BinaryIO, *, path: str, number: int, shape: list[int], twice: bool
 ) -> dict[str, Any]:
-    """Write the pixels of a tile-compressed image to ``target``; returns the type of its numbers, and whether DATASUM contradicts its tiles.
+    """Write the pixels of a tile-compressed image to ``target``; returns the type of its numbers, and whether DATASUM
+    contradicts its tiles.
 
-    twice: decode twice with different contents of new memory, to find pixels that astropy did not write. Call this in a limited
-    process (`psfcore.limited`). Raises DataError "unreadable-pixels".
+    twice: decode twice with different contents of new memory, to find pixels that astropy did not write. Call this in a
+    limited process (`psfcore.limited`). Raises DataError "unreadable-pixels".
     """
     with readable_pixels(path, f"HDU {number}"):
         data = _tiles(path, number)
@@ -213,7 +223,8 @@ def decode_tiles(
             if not np.array_equal(data, _tiles(path, number), equal_nan=True):
                 raise DataError(
                     "unreadable-pixels",
-                    f"expected all {shape} pixels in HDU {number}; its tiles do not hold them all: copy or make the file again",
+                    f"expected all {shape} pixels in HDU {number}; its tiles do not hold them all: copy or make the "
+                    "file again",
                 )
         with fits.open(path, memmap=False, disable_image_compression=True) as hdus:
             damaged = hdus[number].verify_datasum() == 0
@@ -230,7 +241,8 @@ def _tiles(path: str, number: int) -> NDArray[np.generic]:
 @contextmanager
 def readable_pixels(path: str | Path, part: str) -> Iterator[None]:
     """Raise DataError "unreadable-pixels" for the errors of astropy in the block. part: the name of the part, for the
-    message."""
+    message.
+    """
     try:
         yield
     except DataError:
@@ -240,7 +252,8 @@ def readable_pixels(path: str | Path, part: str) -> Iterator[None]:
             raise  # the disk caused the error; the content of a file causes others, such as a negative size
         raise DataError(
             "unreadable-pixels",
-            f"expected readable pixels in {part} of {Path(path).name}; got: {error!s:.120}: copy or make the file again",
+            f"expected readable pixels in {part} of {Path(path).name}; got: {error!s:.120}: copy or make the file "
+            "again",
         ) from None
 
 
@@ -251,7 +264,8 @@ def ascii_text(text: str) -> str:
 
 def as_written(hdu: Any) -> bool:
     """Whether an HDU is unchanged since `write_hdus` wrote it: its checksums are correct, and `write_hdus` computed
-    them."""
+    them.
+    """
     ours = (
         key in hdu.header and hdu.header.comments[key] == _CHECKSUM_COMMENT for key in ("CHECKSUM", "DATASUM")
     )

@@ -55,17 +55,18 @@ _TWICE = "use the original image, or allow a second deconvolution"
 _NOT_AGAIN = {
     ELSEWHERE: (
         "already-deconvolved",
-        "expected an image that was not deconvolved before; the HISTORY of its header says that other software deconvolved it: "
-        + _TWICE,
+        "expected an image that was not deconvolved before; the HISTORY of its header says that other software "
+        "deconvolved it: " + _TWICE,
     ),
     PRODUCT: (
         "already-deconvolved",
-        "expected an image that was not deconvolved before; the header (PSFID) says that heliopsf made it by deconvolution: "
-        + _TWICE,
+        "expected an image that was not deconvolved before; the header (PSFID) says that heliopsf made it by "
+        "deconvolution: " + _TWICE,
     ),
     PSF: (
         "psf-as-image",
-        "expected an image; the header (PSFSUM) says that the file is a PSF: name it as the PSF, or allow it to be deconvolved",
+        "expected an image; the header (PSFSUM) says that the file is a PSF: name it as the PSF, or allow it to be "
+        "deconvolved",
     ),
 }
 # Names of filters. XRT has two filter wheels and one of the last two cards for each; the others have FILTER.
@@ -84,8 +85,9 @@ _FIT_CARDS = (
 class HeaderSummary:
     """The first 2-D image of a file: its HDU, its shape (ny, nx) and values of its header.
 
-    A value is None if its card is missing or unusable. content: IMAGE, PRODUCT or PSF, see `content_of`. cards: the usable
-    cards that are compared to find out whether a PSF and an image fit together, and those of the publication of a PSF.
+    A value is None if its card is missing or unusable. content: IMAGE, PRODUCT or PSF, see `content_of`. cards: the
+    usable cards that are compared to find out whether a PSF and an image fit together, and those of the publication of
+    a PSF.
     """
 
     hdu: int
@@ -162,7 +164,8 @@ def content_of(header: Header) -> str:
 def check_not_deconvolved(content: str) -> None:
     """Raise DataError if the content of a file is not IMAGE. content: the result of `content_of`.
 
-    Codes: "already-deconvolved" for a product and for an image that other software deconvolved, "psf-as-image" for a PSF.
+    Codes: "already-deconvolved" for a product and for an image that other software deconvolved, "psf-as-image" for a
+    PSF.
     """
     if content in _NOT_AGAIN:
         code, message = _NOT_AGAIN[content]
@@ -184,7 +187,8 @@ def origin_of(header: Cards) -> tuple[str | None, dict[str, str]]:
 
 
 def wavelength_angstrom(header: Cards) -> float | None:
-    """The wavelength of an image in angstrom: WAVELNTH in the unit WAVEUNIT; without WAVELNTH, the text WAVE_LEN of TRACE.
+    """The wavelength of an image in angstrom: WAVELNTH in the unit WAVEUNIT; without WAVELNTH, the text WAVE_LEN of
+    TRACE.
 
     If WAVEUNIT is missing, the unit is angstrom. Returns None if WAVELNTH is missing or not above 0, or if the unit is
     unknown.
@@ -208,14 +212,17 @@ def known_instrument(header: Cards) -> str | None:
 
 
 def optional_exposure_s(header: Cards) -> float | None:
-    """The exposure time in s: the value of XPOSURE, or else of EXPTIME. None if neither card holds a number above zero."""
+    """The exposure time in s: the value of XPOSURE, or else of EXPTIME. None if neither card holds a number above
+    zero.
+    """
     exposures = (optional_number(header, key) or 0.0 for key in ("XPOSURE", "EXPTIME"))
     return next((exposure for exposure in exposures if exposure > 0), None)
 
 
 def seen_by(header: Cards) -> dict[str, Any]:
     """The values of a header that describe the observation: the fields of `HeaderSummary` from instrument to
-    gain_mode."""
+    gain_mode.
+    """
     scale_x, scale_y = frame_of(header).scale_arcsec
     return {
         "instrument": known_instrument(header),
@@ -264,10 +271,11 @@ def summary_of(image: Hdu, *, gzipped: bool) -> HeaderSummary:
 
 
 def observed_at(header: Cards) -> str | None:
-    """The start of the exposure in UTC: DATE-BEG, DATE-OBS or DATE_OBS, with TIME-OBS where the card holds a date alone.
+    """The start of the exposure in UTC: DATE-BEG, DATE-OBS or DATE_OBS, with TIME-OBS where the card holds a date
+    alone.
 
-    The text of the card, if it is ISO 8601 in UTC; converted to that form, if TIMESYS is TAI or TT, or if the second is a
-    leap second. None if there is no such card.
+    The text of the card, if it is ISO 8601 in UTC; converted to that form, if TIMESYS is TAI or TT, or if the second is
+    a leap second. None if there is no such card.
     """
     text = optional_text(header, "DATE-BEG", "DATE-OBS", "DATE_OBS")
     if text is None:
@@ -284,8 +292,9 @@ def observed_at(header: Cards) -> str | None:
 
 
 def instant(text: str) -> datetime | None:
-    """The instant of a date. A date without a time zone is in UTC; a leap second is the first of the next minute. None if
-    the date cannot be read."""
+    """The instant of a date. A date without a time zone is in UTC; a leap second is the first of the next minute. None
+    if the date cannot be read.
+    """
     leap, later = _LEAP_SECOND.fullmatch(text), timedelta()
     if leap is not None:
         text, later = f"{leap[1]}:00{leap[3]}", timedelta(seconds=60 + float(f"0{leap[2] or '.0'}"))

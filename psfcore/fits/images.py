@@ -3,13 +3,13 @@
 In memory, pixels are float64 [y, x] in the byte order of the machine. Files that this module writes hold float32. They
 have the cards CHECKSUM and DATASUM, but no date of writing. Equal content therefore gives equal bytes.
 
-A plane of a product is a plain image HDU with one value for each pixel of the image, with the name of the plane as EXTNAME
-and with the world coordinates of the image. Its header has the card PLANE = T. A plane of bits has a card QBITn for each bit
-n of its values; the card names the bit, and its comment says what the bit means.
+A plane of a product is a plain image HDU with one value for each pixel of the image, with the name of the plane as
+EXTNAME and with the world coordinates of the image. Its header has the card PLANE = T. A plane of bits has a card QBITn
+for each bit n of its values; the card names the bit, and its comment says what the bit means.
 
 These cards describe the file and the origin of a product. Sources: FITS standard 4.0, section 4.4.2; SOLARNET metadata
-recommendations (Haugan and Fredvik 2020) and the Solar Orbiter metadata standard (SOL-SGS-TN-0009) for FILENAME, PARENT,
-CREATOR and LEVEL.
+recommendations (Haugan and Fredvik 2020) and the Solar Orbiter metadata standard (SOL-SGS-TN-0009) for FILENAME,
+PARENT, CREATOR and LEVEL.
 
 | card of the input | card of the product |
 |---|---|
@@ -58,7 +58,7 @@ Cards = Mapping[str, tuple[CardValue, str]]
 Meanings = Mapping[IntFlag, str]
 
 LARGEST_MASK_PX = 16384
-CARD_OF_PASS = "DCNVPASS"
+CARD_OF_PASS = "DCNVPASS"  # noqa: S105  # a card
 _LEVEL = "L3"
 _OF_FILE = ("FILENAME", "DATE", "PARENT", "CREATOR", "LEVEL", "ORIGIN", "VERSION", "JOBID", "PSFDOI")
 _BITS_STORED = {1: np.uint8, 2: np.uint16}

@@ -1,8 +1,9 @@
 """One observation, whatever it came in: the only place where heliopsf understands an image.
 
-A deconvolution, a transit, a flare, a measurement of arms and the comparison of a product all read through this module, so an image
-has one mask, one unit and one saturation level everywhere: from a file (`read_observation`), from HDUs of astropy
-(`observation_of_hdus`), or from pixels and a header in memory (`observation_of`). `unusable` and `saturation` have the rules.
+A deconvolution, a transit, a flare, a measurement of arms and the comparison of a product all read through this module,
+so an image has one mask, one unit and one saturation level everywhere: from a file (`read_observation`), from HDUs of
+astropy (`observation_of_hdus`), or from pixels and a header in memory (`observation_of`). `unusable` and `saturation`
+have the rules.
 """
 
 from __future__ import annotations
@@ -46,8 +47,9 @@ def read_observation(
 ) -> Image:
     """Read an image of a file and mask its unusable pixels.
 
-    saturation_dn: the saturation level in DN of one exposure; None: `saturation` finds it. hdu: number of the HDU; None: the first
-    2-D image. Raises HeaderError for an unusable header; DataError "unreadable-pixels", and the errors of `observation_of`.
+    saturation_dn: the saturation level in DN of one exposure; None: `saturation` finds it. hdu: number of the HDU;
+    None: the first 2-D image. Raises HeaderError for an unusable header; DataError "unreadable-pixels", and the errors
+    of `observation_of`.
     """
     stored = read_pixels(path, limits, hdu=hdu, others=True)
     return _with_planes(
@@ -58,7 +60,8 @@ def read_observation(
 def observation_of_hdus(
     hdus: Mapping[int, Any], number: int, *, chosen: int | None = None, saturation_dn: float | None = None
 ) -> Image:
-    """The image of one HDU of astropy, with the planes in the HDUs after it. hdus: the HDUs with an image of two axes, by their numbers.
+    """The image of one HDU of astropy, with the planes in the HDUs after it. hdus: the HDUs with an image of two axes,
+    by their numbers.
 
     chosen: `number`, if the caller named it. Raises the errors of `observation_of`.
     """
@@ -107,7 +110,8 @@ def _with_planes(
         )
     if stored.damaged:
         warnings["damaged"] = (
-            f"DATASUM of HDU {stored.number} does not agree with its pixels: the file was damaged or changed after it was written; "
+            f"DATASUM of HDU {stored.number} does not agree with its pixels: the file was damaged or changed after it "
+            "was written; "
             "copy it again"
         )
     return image.warned(warnings) if warnings else image
@@ -132,8 +136,8 @@ def real_pixels(data: NDArray[np.generic]) -> NDArray[np.float64]:
 def check_exposure_of_sun(header: Header) -> None:
     """Raise DataError if the header says that a deconvolution of the image makes no sense.
 
-    Codes: "already-deconvolved", "psf-as-image", "not-an-exposure" (a dark, an LED frame, ...), and "bad-unit" for pixels that
-    are not proportional to the light.
+    Codes: "already-deconvolved", "psf-as-image", "not-an-exposure" (a dark, an LED frame, ...), and "bad-unit" for
+    pixels that are not proportional to the light.
     """
     check_not_deconvolved(content_of(header))
     for key in (*_KIND_CARDS, *_HIDDEN):
@@ -143,7 +147,8 @@ def check_exposure_of_sun(header: Header) -> None:
         if kind.upper() == _HIDDEN.get(key) or (key in _KIND_CARDS and any(one in words for one in _NO_SUN)):
             raise DataError(
                 "not-an-exposure",
-                f"expected an exposure of the Sun; the header says {key} = {kind!r:.40}: use another image, or allow it to be "
+                f"expected an exposure of the Sun; the header says {key} = {kind!r:.40}: use another image, or allow "
+                "it to be "
                 "deconvolved (--again, in a request again = true)",
             )
     check_linear(header)
@@ -159,8 +164,8 @@ def observation_of(
 ) -> Image:
     """The image of pixels [y, x] and a header, with its unusable pixels masked.
 
-    bits, planes: see `unusable.unusable_pixels`. Raises DataError "not-2d", "too-small", "no-exposure", "saturation-unit", "all-nan",
-    "all-saturated", "pixel-too-large", "no-signal".
+    bits, planes: see `unusable.unusable_pixels`. Raises DataError "not-2d", "too-small", "no-exposure",
+    "saturation-unit", "all-nan", "all-saturated", "pixel-too-large", "no-signal".
     """
     mask, warnings = unusable_pixels(pixels, header, bits, planes or {})
     if (unused := (mask != 0) & np.isfinite(pixels)).any():
@@ -188,7 +193,8 @@ def _check_signal(image: Image, *, stored_as_integer: bool) -> None:
             )
         raise DataError(
             "all-saturated",
-            f"expected pixels below saturation; all finite pixels are at {image.pixels[image.finite].min():g} or above: check the level",
+            f"expected pixels below saturation; all finite pixels are at {image.pixels[image.finite].min():g} or "
+            "above: check the level",
         )
     whole = bool(valid.all())
     smallest, largest = _range_of(image.pixels if whole else image.pixels[image.finite])
@@ -196,7 +202,8 @@ def _check_signal(image: Image, *, stored_as_integer: bool) -> None:
     if abs(farthest) > LARGEST_PIXEL:
         raise DataError(
             "pixel-too-large",
-            f"expected pixels between -{LARGEST_PIXEL:g} and {LARGEST_PIXEL:g}; got one of {farthest:g}: set such pixels to NaN",
+            f"expected pixels between -{LARGEST_PIXEL:g} and {LARGEST_PIXEL:g}; got one of {farthest:g}: set such "
+            "pixels to NaN",
         )
     if not whole:  # saturated pixels are finite, but say nothing about the signal
         smallest, largest = _range_of(image.pixels[valid])
@@ -205,5 +212,6 @@ def _check_signal(image: Image, *, stored_as_integer: bool) -> None:
     if smallest == largest and stored_as_integer and largest in _FULL_SCALES:
         raise DataError(
             "all-saturated",
-            f"expected pixels below saturation; all pixels are {largest:g}, the largest value of an A/D converter: use another image",
+            f"expected pixels below saturation; all pixels are {largest:g}, the largest value of an A/D converter: "
+            "use another image",
         )

@@ -54,7 +54,9 @@ def write_psf(path: str | Path, psf: Psf, *, instrument_file: bytes | None = Non
 
 
 def write_kernel(path: str | Path, psf: Psf) -> None:
-    """Write the kernel of a PSF and its header, as `write_psf`, but no tables, which a large PSF would need much memory for."""
+    """Write the kernel of a PSF and its header, as `write_psf`, but no tables, which a large PSF would need much memory
+    for.
+    """
     write_hdus(path, [fits.PrimaryHDU(psf.kernel.astype(np.float32), _psf_header(psf))])
 
 
@@ -188,7 +190,9 @@ def stated_id(path: str | Path, limits: FitsLimits) -> str | None:
 
 
 def check_written(_target: BinaryIO, *, path: str, count: int) -> dict[str, Any]:
-    """Whether the first HDUs of a file are as `write_psf` wrote them ("good"). Call it in a limited process (`psfcore.limited`)."""
+    """Whether the first HDUs of a file are as `write_psf` wrote them ("good"). Call it in a limited process
+    (`psfcore.limited`).
+    """
     with readable_pixels(path, "the HDUs"), _first_hdus(path, count) as hdus:
         return {"good": all(map(as_written, hdus))}
 
@@ -215,8 +219,8 @@ def _read_extras(
 def write_extras(target: BinaryIO, *, path: str, count: int, shape: list[int]) -> dict[str, Any]:
     """Write the components of a PSF to ``target``, float64; returns their names, the provenance and the fitted shape.
 
-    HDUs that `write_psf` never writes are ignored: compressed components, components of another shape, and tables with data
-    outside their rows. Call it in a limited process (`psfcore.limited`).
+    HDUs that `write_psf` never writes are ignored: compressed components, components of another shape, and tables with
+    data outside their rows. Call it in a limited process (`psfcore.limited`).
     """
     provenance: dict[str, Any] = {}
     extras: dict[str, Any] = {"components": [], "provenance": provenance, "fitted": None}

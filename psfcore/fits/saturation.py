@@ -1,14 +1,16 @@
 """The saturated pixels of an image: the level from which pixels are saturated, and where it comes from.
 
-The level comes from the request, the header, the instrument file, or the pixels. Cards that give a level: SATURATE, DSATVAL
-(SECCHI, LASCO, WISPR, PUNCH) and SAT_THR (SUVI), in the unit of the image. AIA has no card with the level, but in 26 level 1
-images of a flare of 2012-07-19, NSATPIX is the number of pixels above 15000 DN (in 25 images exactly, in one it is larger by 1), so
-an AIA image with NSATPIX has this level. A pixel of exactly 15000 DN counts as saturated here too.
+The level comes from the request, the header, the instrument file, or the pixels. Cards that give a level: SATURATE,
+DSATVAL (SECCHI, LASCO, WISPR, PUNCH) and SAT_THR (SUVI), in the unit of the image. AIA has no card with the level, but
+in 26 level 1 images of a flare of 2012-07-19, NSATPIX is the number of pixels above 15000 DN (in 25 images exactly, in
+one it is larger by 1), so an AIA image with NSATPIX has this level. A pixel of exactly 15000 DN counts as saturated
+here too.
 
-NSATPIX and DATASAT count the saturated pixels of the exposure. A cut-out has fewer, but no image has more pixels above its level.
-If it has, its values were changed after they were counted (a correction of the degradation, sums of pixels), and the level does not
-belong to them: then as many pixels are masked as the header counts, the brightest ones. The same count decides if a level in DN
-cannot be converted to the unit of the image and the brightest pixels stand apart from the others, and whether a level of the header of a rate is a rate or in DN of the exposure.
+NSATPIX and DATASAT count the saturated pixels of the exposure. A cut-out has fewer, but no image has more pixels above
+its level. If it has, its values were changed after they were counted (a correction of the degradation, sums of pixels),
+and the level does not belong to them: then as many pixels are masked as the header counts, the brightest ones. The same
+count decides if a level in DN cannot be converted to the unit of the image and the brightest pixels stand apart from
+the others, and whether a level of the header of a rate is a rate or in DN of the exposure.
 
 Saturation can also be found without a known level: in a saturated image many pixels have exactly the largest value,
 because the converter or the software that wrote the image cannot write a larger one. In an image that is not saturated,
@@ -19,10 +21,10 @@ should not exceed m:
     P(n) = probability of at least n events of a Poisson distribution with mean m        Eq. (1)
 
 If P is below MASKED_BELOW, the pixels with the largest value are masked as saturated, except if other pixels reach the
-higher level that a card gives.
-If P is only below DOUBTED_BELOW, they may be saturated, and the image gets a warning. The test does not depend on the unit, because values
-that are equal stay equal after a division by the exposure time. If a flat field or an interpolation made the values of
-saturated pixels different from each other, the test cannot find these pixels.
+higher level that a card gives. If P is only below DOUBTED_BELOW, they may be saturated, and the image gets a warning.
+The test does not depend on the unit, because values that are equal stay equal after a division by the exposure time. If
+a flat field or an interpolation made the values of saturated pixels different from each other, the test cannot find
+these pixels.
 
 | symbol | name | unit |
 |---|---|---|
@@ -63,8 +65,9 @@ def with_saturation(
 
     requested_dn, instrument_dn: the levels in DN of one exposure that the request and the instrument file give. The
     level of the request replaces the level of the instrument file. If several levels remain, the lowest one is used. If
-    the request gives no level, the count of the header is compared, and the pixels are tested, see Eq. (1). Raises DataError
-    "saturation-unit" if the request gives a level and the unit of the image is neither counts nor a rate of counts, and "no-exposure".
+    the request gives no level, the count of the header is compared, and the pixels are tested, see Eq. (1). Raises
+    DataError "saturation-unit" if the request gives a level and the unit of the image is neither counts nor a rate of
+    counts, and "no-exposure".
     """
     level = _level(image, requested_dn, instrument_dn)
     if level.found != REQUEST:
@@ -78,7 +81,8 @@ def with_saturation(
                 "" if level.level is None else f" below the saturation level {level.level:g} ({level.found})"
             )
             told = (
-                f"{count} pixels have the value {top:g}, the largest{below}; they are masked as saturated: if they are not, {_SETTING}"
+                f"{count} pixels have the value {top:g}, the largest{below}; they are masked as saturated: if they "
+                f"are not, {_SETTING}"
                 if below or level.warning
                 else None
             )
@@ -128,7 +132,9 @@ def _level(image: Image, requested_dn: float | None, instrument_dn: float | None
 
 
 def _rate_or_counts(image: Image, level: Saturation, scale: float | None) -> Saturation:
-    """The level of a card of an image in DN/s. It may also be in DN of the exposure, if only then pixels are saturated."""
+    """The level of a card of an image in DN/s. It may also be in DN of the exposure, if only then pixels are
+    saturated.
+    """
     if level.level is None or scale is None or np.any(image.pixels >= level.level):
         return level
     counted, there = _stated(image), np.count_nonzero(image.pixels >= level.level / scale)
@@ -138,7 +144,8 @@ def _rate_or_counts(image: Image, level: Saturation, scale: float | None) -> Sat
         return replace(level, level=level.level / scale)
     return replace(
         level,
-        warning=f"no pixel reaches the saturation level {level.found} = {level.level:g}, but {there} pixels do if it is in DN of one exposure: "
+        warning=f"no pixel reaches the saturation level {level.found} = {level.level:g}, but {there} pixels do if it "
+        "is in DN of one exposure: "
         f"if it is, {_SETTING}",
     )
 
@@ -175,14 +182,17 @@ def _counted(image: Image, level: Saturation) -> Saturation:
         return Saturation(
             float(np.partition(values, -counted)[-counted]) if counted else None,
             card,
-            f"{above} pixels are above the saturation level {level.level:g}, but {card} counts {counted} saturated pixels: the values "
-            f"were changed after they were counted; {f'about {counted} of the brightest are' if counted else 'none of them is'} masked: if this is wrong, "
+            f"{above} pixels are above the saturation level {level.level:g}, but {card} counts {counted} saturated "
+            "pixels: the values "
+            "were changed after they were counted; "
+            f"{f'about {counted} of the brightest are' if counted else 'none of them is'} masked: if this is wrong, "
             f"{_SETTING}",
         )
     if level.found == "NSATPIX" and counted and not np.any(image.pixels >= level.level):
         return replace(
             level,
-            warning=f"NSATPIX counts {counted} saturated pixels, but no pixel is at {AIA_LEVEL_DN:g} DN or above: the image "
+            warning=f"NSATPIX counts {counted} saturated pixels, but no pixel is at {AIA_LEVEL_DN:g} DN or above: the "
+            "image "
             f"was cut or its values were changed; saturated pixels that are left are not masked: {_SETTING}",
         )
     return level

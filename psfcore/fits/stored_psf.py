@@ -1,4 +1,6 @@
-"""A stored PSF, without its pixels in this process: check that a file can be a PSF, and write the central part of one."""
+"""A stored PSF, without its pixels in this process: check that a file can be a PSF, and write the central part of
+one.
+"""
 
 from __future__ import annotations
 
@@ -21,8 +23,9 @@ _STORAGE = ("EXTEND", "PCOUNT", "GCOUNT", "BSCALE", "BZERO", "BLANK")
 def check_is_psf(path: str | Path, summary: HeaderSummary, limits: FitsLimits) -> None:
     """Raise DataError if a file is not a PSF. The weights are read in a process of its own.
 
-    summary: the summary of the file's header. Codes: those of `check_no_product`; "psf-nonfinite", "psf-negative", "psf-sum",
-    "psf-not-centred", "psf-off-centre" for weights that no PSF can have; "unreadable-pixels"; and the codes of HeaderError.
+    summary: the summary of the file's header. Codes: those of `check_no_product`; "psf-nonfinite", "psf-negative",
+    "psf-sum", "psf-not-centred", "psf-off-centre" for weights that no PSF can have; "unreadable-pixels"; and the codes
+    of HeaderError.
     """
     check_no_product(summary)
     with open(os.devnull, "wb") as unused:
@@ -49,8 +52,8 @@ def read_weights(target: BinaryIO, *, path: str, limits: dict[str, int]) -> dict
 def write_cutout(path: str | Path, size: int, limits: FitsLimits, target: BinaryIO) -> None:
     """Write the central (size, size) px of a PSF to ``target`` as a FITS file, in a process of its own.
 
-    The weights are not renormalised. The centre of the PSF is at [size // 2, size // 2]. The cards are those of the PSF.
-    Raises HeaderError, DataError "cutout-too-large" if the PSF is smaller, and "unreadable-pixels".
+    The weights are not renormalised. The centre of the PSF is at [size // 2, size // 2]. The cards are those of the
+    PSF. Raises HeaderError, DataError "cutout-too-large" if the PSF is smaller, and "unreadable-pixels".
     """
     shape = read_summary(path, limits).shape
     if not 1 <= size <= min(shape):

@@ -1,9 +1,9 @@
 """The unit of an image's pixels: counts of an exposure, a rate of counts, or another quantity.
 
-Counts are DN, ADU or counts; all three mean numbers of the A/D converter. A rate is counts per time. Both may be written
-per pixel, in every way that `astropy.units` reads, and in the ways of observatories that it does not read ("dn/sec",
-"counts / pixel"). Saturation levels and noise figures are in DN of one exposure, so `dn_per_unit` converts them.
-`unit_label` and `rate_label` are the units that pictures show.
+Counts are DN, ADU or counts; all three mean numbers of the A/D converter. A rate is counts per time. Both may be
+written per pixel, in every way that `astropy.units` reads, and in the ways of observatories that it does not read
+("dn/sec", "counts / pixel"). Saturation levels and noise figures are in DN of one exposure, so `dn_per_unit` converts
+them. `unit_label` and `rate_label` are the units that pictures show.
 """
 
 from __future__ import annotations
@@ -54,7 +54,9 @@ class PixelUnit:
 
 
 def unit_of(header: Cards) -> PixelUnit:
-    """The unit that a header gives: BUNIT, else PIXLUNIT (AIA); images of XRT are in DN, or in DN/s if HISTORY says so."""
+    """The unit that a header gives: BUNIT, else PIXLUNIT (AIA); images of XRT are in DN, or in DN/s if HISTORY says
+    so.
+    """
     return parse_unit(optional_text(header, "BUNIT", "PIXLUNIT") or _unit_of_xrt(header))
 
 
@@ -82,7 +84,8 @@ def check_linear(header: Cards) -> None:
     if any(mark in text.lower().replace(" ", "") for mark in _NOT_LINEAR):
         raise DataError(
             "bad-unit",
-            f"expected pixels that are proportional to the light, such as DN or DN/s; got the unit {text:.40}: convert the "
+            f"expected pixels that are proportional to the light, such as DN or DN/s; got the unit {text:.40}: "
+            "convert the "
             "pixels first",
         )
 
@@ -99,7 +102,8 @@ def per_dn(unit: PixelUnit, exposure_s: float | None, purpose: str) -> float:
     if unit.kind == "rate":
         raise DataError(
             "no-exposure",
-            f"expected XPOSURE or EXPTIME in the header, {purpose} of an image in {unit.text}; got neither: add one of them",
+            f"expected XPOSURE or EXPTIME in the header, {purpose} of an image in {unit.text}; got neither: add one "
+            "of them",
         )
     raise DataError(
         "saturation-unit",

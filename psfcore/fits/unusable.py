@@ -1,21 +1,23 @@
-"""Pixels that hold no measurement: lost blocks, blocks of zeros, counts that wrapped around, and pixels that a plane declares bad.
+"""Pixels that hold no measurement: lost blocks, blocks of zeros, counts that wrapped around, and pixels that a plane
+declares bad.
 
-**Lost.** A telescope or its pipeline fills a lost block of telemetry with a number that no exposure gives: the value of the
-card BLANK (of stored integers), -32768, -999 and others. Pixels with the value of BLANK are lost. Another such value is lost if it
-is far below all other pixels:
+**Lost.** A telescope or its pipeline fills a lost block of telemetry with a number that no exposure gives: the value of
+the card BLANK (of stored integers), -32768, -999 and others. Pixels with the value of BLANK are lost. Another such
+value is lost if it is far below all other pixels:
 
     next - value > FAR (median - next),   next: the smallest other value           Eq. (1)
 
 The darkest pixels of an image of light scatter around a value near 0, so none of them is that far from the others.
 
-**Wrapped.** A count above 32767 that was written as a signed integer of 16 bits became negative. The image then has values above half
-of that range, and its negative values end with a gap for which Eq. (1) holds.
+**Wrapped.** A count above 32767 that was written as a signed integer of 16 bits became negative. The image then has
+values above half of that range, and its negative values end with a gap for which Eq. (1) holds.
 
-**Zeros.** An interrupted download, or software that replaces NaN, leaves blocks of exact zeros with a sharp edge: beside them, hardly
-any pixel is 0, and the darkest pixels are not much darker than the others. Zeros among the counts of a faint corona are no such block.
+**Zeros.** An interrupted download, or software that replaces NaN, leaves blocks of exact zeros with a sharp edge:
+beside them, hardly any pixel is 0, and the darkest pixels are not much darker than the others. Zeros among the counts
+of a faint corona are no such block.
 
-**Planes.** Images of a file that describe the image: MASK, DQF, DQ and QUALITY declare pixels that are not 0 as bad, and UNCERT, ERR
-and VARIANCE those that are not finite.
+**Planes.** Images of a file that describe the image: MASK, DQF, DQ and QUALITY declare pixels that are not 0 as bad,
+and UNCERT, ERR and VARIANCE those that are not finite.
 """
 
 from __future__ import annotations
@@ -46,7 +48,8 @@ def unusable_pixels(
 ) -> tuple[NDArray[np.uint8], dict[str, str]]:
     """The mask [y, x] (bits of MaskBit) of pixels without a measurement, and warnings by their codes.
 
-    bits: BITPIX of the image as it was stored; None: unknown. planes: images of the same shape, by their names (see the module).
+    bits: BITPIX of the image as it was stored; None: unknown. planes: images of the same shape, by their names (see the
+    module).
     """
     mask = np.where(np.isfinite(pixels), np.uint8(0), np.uint8(MaskBit.NONFINITE))
     warnings = {}
@@ -172,7 +175,9 @@ def _grown(where: Where, reach_px: int) -> Where:
 
 
 def _rows_of_zeros(zero: Where) -> Where | None:
-    """The rows of nothing but 0 at the bottom and the top, if the rows beside them are mostly not 0; None if there are none."""
+    """The rows of nothing but 0 at the bottom and the top, if the rows beside them are mostly not 0; None if there are
+    none.
+    """
     some, found = np.flatnonzero(~zero.all(axis=1)), np.zeros(zero.shape, np.bool_)
     if not some.size:
         return None

@@ -8,8 +8,8 @@ around the centre are free:
     minimise sum over u of ((s_u - d_u) / e_u)^2   with   mean s = mean d at 60 to 70 px     Eq. (2)
 
 d is the flare image minus an image from before the flare. s_u and d_u are means over the pixels of a strip along the
-arm, one mean for each distance u in steps of 1 px. If the noise of the camera is known, e_u is the noise of d_u, and the
-sum is chi^2. Otherwise e_u = d_u, and the root of the mean of the terms is the percentage error that the paper
+arm, one mean for each distance u in steps of 1 px. If the noise of the camera is known, e_u is the noise of d_u, and
+the sum is chi^2. Otherwise e_u = d_u, and the root of the mean of the terms is the percentage error that the paper
 minimises. Non-negative least squares (Lawson and Hanson 1974, chapter 23) finds the minimum. The constraint is an
 additional row with a large weight (their chapter 22).
 
@@ -82,8 +82,9 @@ class FlareFit:
     """The light along an arm as simulated with one PSF, and the fitted flare.
 
     box [y, x]: light of the flare. simulated: s_u. rms_pct: root mean square of 100 (s_u / d_u - 1) over the distances
-    with d_u > 0. chi2_per_distance: the sum in Eq. (2) divided by the number of distances; None if the noise is unknown.
-    reduced_chi2: the same sum divided by the degrees of freedom (number of distances - number of used pixels of the box
+    with d_u > 0. chi2_per_distance: the sum in Eq. (2) divided by the number of distances; None if the noise is
+    unknown. reduced_chi2: the same sum divided by the degrees of freedom (number of distances - number of used pixels
+    of the box
     + 1 for the constraint). matched: mean s divided by mean d at 60 to 70 px. matched_noise_pct: the noise of mean d,
     in percent of mean d; the constraint treats mean d as exact.
     """
@@ -179,8 +180,8 @@ def arm_profile(
 ) -> ArmProfile:
     """Profile along the arm that leaves the centre at `arm_deg`, degrees from +x towards +y.
 
-    Distances at which less than half of the strip is usable are left out. variance [y, x]: the variance of each pixel of
-    the difference. Raises DataError "flare-bad-centre", "flare-short-arm".
+    Distances at which less than half of the strip is usable are left out. variance [y, x]: the variance of each pixel
+    of the difference. Raises DataError "flare-bad-centre", "flare-short-arm".
     """
     ny, nx = difference.shape
     if not (0 <= centre_xy[0] < nx and 0 <= centre_xy[1] < ny):

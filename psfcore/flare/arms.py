@@ -8,16 +8,16 @@ are narrow, so every order is the same picture S of the source:
     r_ak = r_0 + k s e_a,   e_a = (cos t_a, sin t_a),   k = +-1, +-2, ...                            Eq. (1)
     d(r) = sum over a, k of A_ak S(r - r_ak) + plane_ak(r),                                          Eq. (2)
 
-S is a cubic spline on the pixels. Each order has its own plane, on the pixels that are nearest to this order. Before the
-fit, the smooth light around the source is subtracted: the median of each ring without the arms. Weighted least squares
-(Gauss-Newton) fits all quantities together except r_0, because an error of r_0 only shifts S. The errors of t and s come
-from the normal equations with all other quantities free; they are multiplied by the square root of the reduced chi^2.
-S must be at least one pixel wide, as in real images. If each order of a point source filled a single pixel, the fit
-could only find the centres of these pixels.
+S is a cubic spline on the pixels. Each order has its own plane, on the pixels that are nearest to this order. Before
+the fit, the smooth light around the source is subtracted: the median of each ring without the arms. Weighted least
+squares (Gauss-Newton) fits all quantities together except r_0, because an error of r_0 only shifts S. The errors of t
+and s come from the normal equations with all other quantities free; they are multiplied by the square root of the
+reduced chi^2. S must be at least one pixel wide, as in real images. If each order of a point source filled a single
+pixel, the fit could only find the centres of these pixels.
 
-The first values of angles and spacing come from a grid search: the smooth part of the image is removed, and at the correct
-angle and spacing, the remaining image is brighter at the orders than halfway between the orders. `arms_fit` implements
-Eq. (1) and Eq. (2).
+The first values of angles and spacing come from a grid search: the smooth part of the image is removed, and at the
+correct angle and spacing, the remaining image is brighter at the orders than halfway between the orders. `arms_fit`
+implements Eq. (1) and Eq. (2).
 
 | symbol | name | unit |
 |---|---|---|
@@ -108,8 +108,8 @@ def measure_arms(
     """Measure `n_arms` arms around a flare in `image` [y, x] (DN), or in `image` minus `reference`.
 
     centre_xy: position of the source; default: the middle of the largest saturated patch, else the brightest pixel.
-    saturated: True where pixels must not be used; pixels that are not finite are never used.
-    source_radius_px: half size of S; default: from the saturated patch. reach_px: largest radius at which orders are used.
+    saturated: True where pixels must not be used; pixels that are not finite are never used. source_radius_px: half
+    size of S; default: from the saturated patch. reach_px: largest radius at which orders are used.
 
     Raises DataError "arms-bad-input", "all-masked", "no-flare", "too-few-peaks".
     """
@@ -240,7 +240,8 @@ def smooth(plane: Plane, usable: Flags, width_px: float) -> Plane:
 
 def expected_light(image: Plane, reference: Plane | None, usable: Flags) -> Plane:
     """The light (DN, smoothed) that causes the photon noise of the difference: the image, plus the reference if it is
-    given."""
+    given.
+    """
     counts = image if reference is None else image + reference
     return smooth(np.nan_to_num(counts), usable, 2.0)
 
@@ -305,7 +306,9 @@ def search_arms(
 
 
 def _contrast(difference: Plane, usable: Flags) -> Plane:
-    """The image without its smooth part, divided by its local standard deviation, clipped at +-_CUT; 0 where unusable."""
+    """The image without its smooth part, divided by its local standard deviation, clipped at +-_CUT; 0 where
+    unusable.
+    """
     detail = smooth(difference, usable, 0.7) - smooth(difference, usable, 5.0)
     scatter = np.sqrt(smooth(detail**2, usable, 15.0))
     ratio = np.divide(detail, scatter, out=np.zeros_like(detail), where=usable & (scatter > 0))

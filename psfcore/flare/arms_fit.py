@@ -1,7 +1,7 @@
 """The diffraction orders along the arms, Eq. (1) of `arms`, and the least-squares fit of Eq. (2).
 
-The fitted quantities are amplitudes, source, angles and spacing. First, amplitudes and source are fitted in turn, at fixed
-angles and spacing. Then Gauss-Newton steps fit all quantities together.
+The fitted quantities are amplitudes, source, angles and spacing. First, amplitudes and source are fitted in turn, at
+fixed angles and spacing. Then Gauss-Newton steps fit all quantities together.
 """
 
 from __future__ import annotations
@@ -293,7 +293,8 @@ class _Bases:
 
     def stamps(self, source: Plane, *, slope: str = "") -> Vector:
         """The values of S on the box of each order [order, y, x]. slope: "x" or "y" for the derivative along this
-        axis."""
+        axis.
+        """
         along_x = self.slope_x if slope == "x" else self.x
         along_y = self.slope_y if slope == "y" else self.y
         return np.asarray(along_y @ source @ along_x.transpose(0, 2, 1))

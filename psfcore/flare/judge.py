@@ -45,11 +45,10 @@ def judge_on_flare(
 ) -> FlareTest:
     """Simulate the stray light of a flare with ``psf``, and compare it with the observed light along a diffraction arm.
 
-    centre_xy: position of the flare, px, which is rounded; default: it is found in the images. arm_deg: direction of the arm, from +x
-    towards +y; default: it is measured, and the arm nearest to +x is used. noise: the noise of the camera; chi2 is
-    computed only if it is given.
-    Raises DataError "plate-scale-mismatch", "flare-shapes", "flare-units", and the errors of ``compare_on_flare`` and
-    ``measure_arms``.
+    centre_xy: position of the flare, px, which is rounded; default: it is found in the images. arm_deg: direction of
+    the arm, from +x towards +y; default: it is measured, and the arm nearest to +x is used. noise: the noise of the
+    camera; chi2 is computed only if it is given. Raises DataError "plate-scale-mismatch", "flare-shapes",
+    "flare-units", and the errors of ``compare_on_flare`` and ``measure_arms``.
     """
     check_compatible(flaring, psf)
     light, quiet, unit = _same_unit(flaring, before)
@@ -78,7 +77,8 @@ def _same_unit(flaring: Image, before: Image) -> tuple[Plane, Plane, str]:
     if flaring.pixels.shape != before.pixels.shape:
         raise DataError(
             "flare-shapes",
-            f"expected two images of the same shape; got {flaring.pixels.shape} and {before.pixels.shape}: cut both to the "
+            f"expected two images of the same shape; got {flaring.pixels.shape} and {before.pixels.shape}: cut both "
+            "to the "
             "same field",
         )
     rates = [_rate(image) for image in (flaring, before)]
@@ -87,7 +87,8 @@ def _same_unit(flaring: Image, before: Image) -> tuple[Plane, Plane, str]:
     elif rates[0] is None or rates[1] is None:
         raise DataError(
             "flare-units",
-            f"expected the exposure time of both images or of neither; got {flaring.exposure_s} and {before.exposure_s} s: "
+            f"expected the exposure time of both images or of neither; got {flaring.exposure_s} and "
+            f"{before.exposure_s} s: "
             "add XPOSURE to the header without it",
         )
     else:
@@ -141,7 +142,8 @@ def summary_lines(found: FlareComparison) -> list[str]:
         if fit is not None:
             chi2 = "" if fit.chi2_per_distance is None else f", chi2 {fit.chi2_per_distance:.2f} per distance"
             lines.append(
-                f"{name:<18} {fit.rms_pct:7.1f} % rms error{chi2}; fitted flare: {fit.box.sum():.3g} in {fit.used_pixels} px"
+                f"{name:<18} {fit.rms_pct:7.1f} % rms error{chi2}; fitted flare: {fit.box.sum():.3g} in "
+                f"{fit.used_pixels} px"
             )
     if found.rms_factor is not None:
         chi2 = "" if found.chi2_factor is None else f" and {found.chi2_factor:.0f} times the chi2"
@@ -157,12 +159,14 @@ def _cautions(found: FlareComparison) -> list[str]:
     lines = []
     if found.explained < ENOUGH_EXPLAINED:
         lines.append(
-            f"note: outside the arm, the stray light of the fitted flare explains only {100 * max(found.explained, 0):.0f} % "
+            "note: outside the arm, the stray light of the fitted flare explains only "
+            f"{100 * max(found.explained, 0):.0f} % "
             "of the change between the images. Something else changed too, so this comparison says little about the PSF"
         )
     noise_pct = found.total.matched_noise_pct
     if noise_pct is not None and noise_pct > WELL_MATCHED_PCT:
         lines.append(
-            f"note: the fit is matched to the light at 60 to 70 px, but noise makes this light uncertain by {noise_pct:.0f} %"
+            "note: the fit is matched to the light at 60 to 70 px, but noise makes this light uncertain by "
+            f"{noise_pct:.0f} %"
         )
     return lines

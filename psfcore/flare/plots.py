@@ -48,7 +48,10 @@ def flare_png(
 def _heading(found: FlareComparison) -> str:
     words = f"Arm at {found.profile.arm_deg:.2f} degrees: {_summary('total PSF', found.total)}"
     if found.diffraction is not None:
-        words += f"; {_summary('diffraction alone', found.diffraction)}, {found.rms_factor:.1f} times the rms error of the total PSF"
+        words += (
+            f"; {_summary('diffraction alone', found.diffraction)}, {found.rms_factor:.1f} times the rms error "
+            "of the total PSF"
+        )
     return words
 
 

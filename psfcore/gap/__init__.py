@@ -3,7 +3,8 @@
 This package and `psfcore.blind` share no code on purpose: the blind set tests this library, so its effects are written
 independently.
 
-Each effect is one `effect.Effect`. To add an effect of your own, write a Python file that defines EFFECTS, like this one:
+Each effect is one `effect.Effect`. To add an effect of your own, write a Python file that defines EFFECTS, like this
+one:
 
     import numpy as np
     from psfcore.gap.effect import Change, Effect, EffectParameter

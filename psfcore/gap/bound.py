@@ -1,17 +1,17 @@
 """The bound of a simulated case: what a Bayes observer can know about each true cause from such data.
 
-The observer knows the noise and the true form of each cause, and has the forms of the library and the free fields as rivals. Its data
-are simulated in the design of the case: images without noise give the change by a cause, and its cells and blocks (`evidence.cells`,
-`unocculted_blocks`) get noise and a random brightness DRAWS times. For each draw, the observer weighs no cause and every form alone
-(`closed_form`), and answers as `verdict.answer` does, at the level LEVEL.
+The observer knows the noise and the true form of each cause, and has the forms of the library and the free fields as
+rivals. Its data are simulated in the design of the case: images without noise give the change by a cause, and its cells
+and blocks (`evidence.cells`, `unocculted_blocks`) get noise and a random brightness DRAWS times. For each draw, the
+observer weighs no cause and every form alone (`closed_form`), and answers as `verdict.answer` does, at the level LEVEL.
 
     python -m psfcore.gap.bound FOLDER FILE.json
 
-FOLDER/without_effects and FOLDER/effect_0, ... are transits of noise-free images (DN, fractions allowed), with the noise figures of
-real ones; FOLDER/causes.json names the cause and the right families of each. FILE.json (gap-bound/1) states for each cause its
-noncentrality (the chi2 of its change that a refit of the PSF leaves), and the probability that the observer detects a gap, and that
-its answer is the truth alone at the levels of the name, the family and the stage. It is a separate program, so that the code that
-simulated the transit and the gap library share nothing.
+FOLDER/without_effects and FOLDER/effect_0, ... are transits of noise-free images (DN, fractions allowed), with the
+noise figures of real ones; FOLDER/causes.json names the cause and the right families of each. FILE.json (gap-bound/1)
+states for each cause its noncentrality (the chi2 of its change that a refit of the PSF leaves), and the probability
+that the observer detects a gap, and that its answer is the truth alone at the levels of the name, the family and the
+stage. It is a separate program, so that the code that simulated the transit and the gap library share nothing.
 """
 
 from __future__ import annotations
@@ -48,7 +48,9 @@ DRAWS, LEVEL = 100, 0.9
 
 @dataclass(frozen=True)
 class TrueCause:
-    """A true cause. name: its name in the library; None if it is withheld. families: the right families, the main one first."""
+    """A true cause. name: its name in the library; None if it is withheld. families: the right families, the main one
+    first.
+    """
 
     transit: Transit
     name: str | None
@@ -67,7 +69,9 @@ class Bound:
 
 
 def bounds(without: Transit, causes: Sequence[TrueCause], seed: int = 1) -> tuple[Bound, ...]:
-    """The bound of every cause alone. without: the noise-free images without any cause. Raises the errors of `invert`."""
+    """The bound of every cause alone. without: the noise-free images without any cause. Raises the errors of
+    `invert`.
+    """
     solution = invert(without)
     true = [_true_effect(number, cause, without) for number, cause in enumerate(causes)]
     evidence = gather(solution, (*LIBRARY, *true))

@@ -1,12 +1,12 @@
 """The corrected PSF: it is fitted together with the named effects, and contains the changes by effects of the optics.
 
-H is the PSF fitted together with the effects. theta_k is parameter k of the effects of the optics. dH_k is the change of
-the image of a point source for one unit of theta_k. To first order, the corrected PSF is
+H is the PSF fitted together with the effects. theta_k is parameter k of the effects of the optics. dH_k is the change
+of the image of a point source for one unit of theta_k. To first order, the corrected PSF is
 
     H' = H + sum over k of theta_k dH_k        Eq. (1)
 
-Negative values of H' are set to zero, and H' is scaled to the sum of H. An effect of the detector or of the scene is not
-part of a PSF: it changes H only because the fit no longer mistakes its light for scatter. For an effect that varies
+Negative values of H' are set to zero, and H' is scaled to the sum of H. An effect of the detector or of the scene is
+not part of a PSF: it changes H only because the fit no longer mistakes its light for scatter. For an effect that varies
 across the field, dH_k is the change at the centre of the field.
 """
 
@@ -33,9 +33,9 @@ from psfcore.transit.transit import Place
 def corrected_psf(found: Diagnosis, name: str, version: str, provenance: dict[str, Any]) -> Psf:
     """The corrected PSF of a diagnosis, on the full reach, with the components DIFFRACTION and SCATTER.
 
-    provenance: the software and the parents of the PSF. This function adds the effects, their parameters with errors, the gap
-    without and with these effects, and the input files. Raises DataError "no-answer" if the diagnosis made no full refit,
-    "bad-effects" if an added effect fails, and the errors of `Psf`.
+    provenance: the software and the parents of the PSF. This function adds the effects, their parameters with errors,
+    the gap without and with these effects, and the input files. Raises DataError "no-answer" if the diagnosis made no
+    full refit, "bad-effects" if an added effect fails, and the errors of `Psf`.
     """
     added = found.corrected
     if added is None:

@@ -7,8 +7,8 @@ The steps, in this order:
 3. Simulate the transit from this fit, fit the simulation, and keep its residuals: the expected gap.
 4. Compute how the discs and the unocculted field respond to every effect and every field.
 5. Weigh all hypotheses in closed form, and read the answer off their probabilities (`verdict.answer`).
-6. Fit the told causes: the most probable alternative of each cause, without the Sun. If they are effects of the library, make one
-   full refit with them in the model; it gives the corrected PSF.
+6. Fit the told causes: the most probable alternative of each cause, without the Sun. If they are effects of the
+   library, make one full refit with them in the model; it gives the corrected PSF.
 7. Locate the gap, and compute gap and closure on held-out images.
 """
 
@@ -58,8 +58,8 @@ from psfcore.transit.transit import Fold, Transit
 class Shrinking:
     """How far causes close the gap.
 
-    closure: the closure if blocks of time are held out. closure_by_pointing: the closure if one pointing at a time is held
-    out. Both are None if there is no gap. held_out_fall: `closure.fall` for the blocks of time.
+    closure: the closure if blocks of time are held out. closure_by_pointing: the closure if one pointing at a time is
+    held out. Both are None if there is no gap. held_out_fall: `closure.fall` for the blocks of time.
     """
 
     closure: Interval | None
@@ -71,13 +71,14 @@ class Shrinking:
 class Diagnosis:
     """The diagnosis of one transit.
 
-    Three values of the gap: before_refit, with the PSF that was fitted together with the told causes, but without them; rms, with the
-    PSF refitted without any cause; after, with the told causes in the model. fits: the linear fits of all single effects, by name, the
-    most probable first. told: the linear fit of the told causes together; None if there are none. p_value: the p-value of the gap.
-    limits: the limits of all effects. shrinking: how far each single effect closes the gap, by name. shrinking_of_told: the same for
-    the told causes. corrected: the full refit with the told causes, if they are effects of the library and the refit succeeded. shapes:
-    the shape of each alternative that is another form of its family, by the name of the family. residual, residual_after: the residuals
-    of held-out images without and with the told causes. cautions: sentences on everything that weakens the result.
+    Three values of the gap: before_refit, with the PSF that was fitted together with the told causes, but without them;
+    rms, with the PSF refitted without any cause; after, with the told causes in the model. fits: the linear fits of all
+    single effects, by name, the most probable first. told: the linear fit of the told causes together; None if there
+    are none. p_value: the p-value of the gap. limits: the limits of all effects. shrinking: how far each single effect
+    closes the gap, by name. shrinking_of_told: the same for the told causes. corrected: the full refit with the told
+    causes, if they are effects of the library and the refit succeeded. shapes: the shape of each alternative that is
+    another form of its family, by the name of the family. residual, residual_after: the residuals of held-out images
+    without and with the told causes. cautions: sentences on everything that weakens the result.
     """
 
     answer: Answer
@@ -130,12 +131,13 @@ def diagnose(
 ) -> Diagnosis:
     """Fit a transit and diagnose the residuals of the fit.
 
-    start: the coordinates of the shape from which the fit starts (None: the default start of the shape). refit: whether to make a full
-    refit with the told causes in the model. seed: seeds the simulation and the bootstrap of the intervals. coverage: the probability with
-    which a group of alternatives contains the true cause. solution: an existing solution of this transit, shape and start, or a
-    function that makes it; None: `invert` makes it. If the noise measured in the images differs from the noise that the transit
-    states, the solution must be made with the measured noise. Raises the errors of `psfcore.scatter.inversion.solution_of`
-    and `invert`, DataError "bad-library" if the library is empty, "bad-coverage", and "bad-effects" if an added effect fails.
+    start: the coordinates of the shape from which the fit starts (None: the default start of the shape). refit: whether
+    to make a full refit with the told causes in the model. seed: seeds the simulation and the bootstrap of the
+    intervals. coverage: the probability with which a group of alternatives contains the true cause. solution: an
+    existing solution of this transit, shape and start, or a function that makes it; None: `invert` makes it. If the
+    noise measured in the images differs from the noise that the transit states, the solution must be made with the
+    measured noise. Raises the errors of `psfcore.scatter.inversion.solution_of` and `invert`, DataError "bad-library"
+    if the library is empty, "bad-coverage", and "bad-effects" if an added effect fails.
     """
     if not library:
         raise DataError("bad-library", "expected a library with at least one effect; got none: add an effect")
@@ -211,7 +213,9 @@ def diagnose(
 
 
 def _told(model: LinearModel, answer: Answer) -> EffectFit | None:
-    """The linear fit of the most probable alternative of each cause, without the Sun; None if there is nothing to fit."""
+    """The linear fit of the most probable alternative of each cause, without the Sun; None if there is nothing to
+    fit.
+    """
     first = [cause.alternatives[0] for cause in answer.causes]
     evidence, names = model.evidence, []
     for one in first:
@@ -306,7 +310,8 @@ def _shrinking(
 def start_of(psf: Psf) -> tuple[Shape, Vector]:
     """The shape with which a PSF was fitted, and the fitted coordinates. `diagnose` can start from these coordinates.
 
-    Raises DataError "psf-not-fitted" if the PSF was not fitted to a transit, "unknown-shape" if its shape is not known here.
+    Raises DataError "psf-not-fitted" if the PSF was not fitted to a transit, "unknown-shape" if its shape is not known
+    here.
     """
     if psf.fitted is None:
         raise DataError(
@@ -393,13 +398,16 @@ def cautions_of(solution: Solution, noise: MeasuredNoise | None, evidence: Evide
 
 
 def caution_of_closure(label: str, gap_pct: float, error_pct: float) -> tuple[str, ...]:
-    """A sentence if the closure by some effects says little, because their parameters are too uncertain without the held-out images.
+    """A sentence if the closure by some effects says little, because their parameters are too uncertain without the
+    held-out images.
 
     label: the effects. gap_pct: the gap in held-out images, %. error_pct: the error of their prediction, %, rms.
     """
     if error_pct <= gap_pct:
         return ()
     return (
-        f"The closure by {label} says little: without the held-out images, its parameters are so uncertain that they predict the "
-        f"discs of these images only to {error_pct:.1f} %, and the gap is {gap_pct:.1f} %. More images, or longer exposures, would help.",
+        f"The closure by {label} says little: without the held-out images, its parameters are so uncertain that they "
+        "predict the "
+        f"discs of these images only to {error_pct:.1f} %, and the gap is {gap_pct:.1f} %. More images, or longer "
+        "exposures, would help.",
     )

@@ -1,4 +1,5 @@
-"""An effect: a physical cause that the model leaves out. The same declaration serves to explain a gap and to correct for it.
+"""An effect: a physical cause that the model leaves out. The same declaration serves to explain a gap and to correct
+for it.
 
 To first order, an effect changes the images in proportion to a few parameters: e(n), in DN/s, is the change of image n
 for one unit of a parameter. An effect of the optics changes the images by dH x: dH is the change of the PSF, and x is
@@ -37,7 +38,8 @@ class EffectParameter:
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """The change of the images by one unit of one parameter: change(n, images) is the change of image n, [y, x] in DN/s.
+    """The change of the images by one unit of one parameter: change(n, images) is the change of image n, [y, x] in
+    DN/s.
 
     images: one image [y, x] for each image of the transit. To compute the change of the discs, these are the model
     images. To compute the change of the unocculted field, they are the mean images of the pointings. unocculted:
@@ -52,16 +54,16 @@ class Change:
 class Effect:
     """One effect: its physical cause, the observation that would confirm it, and the axes along which the gap varies.
 
-    family: the name of its family in `evidence.tree`; empty: a family of its own. cause: a sentence for the report. settled_by: an observation that would confirm the effect, or exclude it. axes: names of
-    the axes of the report along which the effect varies.
-    changes(view): one change for each parameter. An effect that is fitted for each pointing may return fewer or more
-    changes than it has parameters. In this case, changes and parameters are paired in order. A change or parameter
-    without a partner is not fitted. why_not(view): the reason why these data cannot show the effect; None if they can.
-    trials: the approximate number of positions or templates among which the effect searches; it raises the p-value and the detection limit.
-    distinguished(view): how many of these the data distinguish (`search.distinguished`; None: all of them); a larger number
-    lowers the evidence. held(view): for an effect that searches for a position or a template, the same effect with the result of
-    the search fixed. field: whether the parameters describe a random field, in which each parameter is about as large
-    as `likely`.
+    family: the name of its family in `evidence.tree`; empty: a family of its own. cause: a sentence for the report.
+    settled_by: an observation that would confirm the effect, or exclude it. axes: names of the axes of the report along
+    which the effect varies. changes(view): one change for each parameter. An effect that is fitted for each pointing
+    may return fewer or more changes than it has parameters. In this case, changes and parameters are paired in order. A
+    change or parameter without a partner is not fitted. why_not(view): the reason why these data cannot show the
+    effect; None if they can. trials: the approximate number of positions or templates among which the effect searches;
+    it raises the p-value and the detection limit. distinguished(view): how many of these the data distinguish
+    (`search.distinguished`; None: all of them); a larger number lowers the evidence. held(view): for an effect that
+    searches for a position or a template, the same effect with the result of the search fixed. field: whether the
+    parameters describe a random field, in which each parameter is about as large as `likely`.
     """
 
     name: str

@@ -15,7 +15,9 @@ _CALIBRATION = Path(__file__).parent / "verdict" / "calibration.json"
 
 @cache
 def library_sha256() -> str:
-    """SHA-256 (hex) of the source texts of the library of effects, and of the calibration that was made with this library."""
+    """SHA-256 (hex) of the source texts of the library of effects, and of the calibration that was made with this
+    library.
+    """
     texts = (*sorted(_LIBRARY.glob("*.py")), _CALIBRATION)
     return hashlib.sha256(b"".join(path.read_bytes() for path in texts)).hexdigest()
 

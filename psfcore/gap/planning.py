@@ -62,7 +62,8 @@ class Planned:
     @property
     def pointings(self) -> list[dict[str, Any]]:
         """For each pointing: its number, its view (the part of the Sun), the number of images, and the exposure times,
-        s."""
+        s.
+        """
         rows = []
         for pointing in self.plan.pointings:
             exposures = [shot.exposure_s for shot in self.plan.shots if shot.pointing == pointing]
@@ -145,7 +146,8 @@ def _check_images(plan: Plan) -> None:
     if len(plan.shots) < LEAST_FRAMES:
         raise DataError(
             "too-few-images",
-            f"expected a plan with at least {LEAST_FRAMES} images, which the fit of a PSF needs; got {len(plan.shots)}: add images",
+            f"expected a plan with at least {LEAST_FRAMES} images, which the fit of a PSF needs; got "
+            f"{len(plan.shots)}: add images",
         )
 
 

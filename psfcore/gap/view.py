@@ -118,8 +118,8 @@ class View:
     def pointing_means(self) -> list[Field]:
         """For every image, the mean of `unocculted` over the images of its pointing [y, x], DN/s.
 
-        All images of a pointing share one array. A template made from this array differs between images only if the effect
-        itself differs between them.
+        All images of a pointing share one array. A template made from this array differs between images only if the
+        effect itself differs between them.
         """
         pointing = [frame.pointing for frame in self.solution.transit.frames]
         sums = {one: np.zeros(self.solution.transit.shape) for one in pointing}
@@ -150,24 +150,28 @@ class View:
         return solution.optics.field(solution.sky.scenes[n]), away
 
     def pointing_scene(self, n: int) -> Field:
-        """The mean scene of the pointing of frame n [y, x], DN/s. Each image contributes only the pixels away from its disc."""
+        """The mean scene of the pointing of frame n [y, x], DN/s. Each image contributes only the pixels away from its
+        disc.
+        """
         total, count = self._scene_sums[self.solution.transit.frames[n].pointing]
         own, _ = self._own(n)
         return np.asarray(np.where(count > 0, total / np.maximum(count, 1), own), dtype=np.float32)
 
     @_of_each_image
     def scenes(self, n: int) -> Field:
-        """The scene [y, x] of every image, DN/s, without the occulter: the mean scene of the other images of the same pointing.
+        """The scene [y, x] of every image, DN/s, without the occulter: the mean scene of the other images of the same
+        pointing.
 
-        This mean is scaled to the brightness of the image. A template that is made from the scene of the same image would
-        contain the noise of its residual, and would fit this noise.
+        This mean is scaled to the brightness of the image. A template that is made from the scene of the same image
+        would contain the noise of its residual, and would fit this noise.
         """
         own, away = self._own(n)
         total, count = self._scene_sums[self.solution.transit.frames[n].pointing]
         others = count - away
         mean = (total - own * away) / np.maximum(others, 1)
         both = (others > 0) & away
-        # Shutter and Sun vary by about one percent. Without this scaling, the template of an effect would have this error.
+        # Shutter and Sun vary by about one percent. Without this scaling, the template of an effect would have this
+        # error.
         light, usual = float(own[both].sum(dtype=np.float64)), float(mean[both].sum())
         brightness = max(light, 0.0) / usual if usual > 0 else 1.0
         return np.asarray(np.where(others > 0, mean * brightness, own), dtype=np.float32)
@@ -175,8 +179,8 @@ class View:
     def uncovered(self, n: int) -> Field:
         """The fraction of each pixel [y, x] that the occulter of frame n does not cover.
 
-        The fraction is set to 1 where no image of the pointing shows the scene behind the disc. There, `scenes` contains the
-        scene of frame n itself, in which the occulter is already dark.
+        The fraction is set to 1 where no image of the pointing shows the scene behind the disc. There, `scenes`
+        contains the scene of frame n itself, in which the occulter is already dark.
         """
         solution = self.solution
         shape, place = solution.transit.shape, solution.sky.found[n].place
@@ -188,7 +192,9 @@ class View:
 
     @_of_each_image
     def occulted_scenes(self, n: int) -> Lanes:
-        """The scene of every image with its occulter in front, in the memory order of the convolution engine. Read-only."""
+        """The scene of every image with its occulter in front, in the memory order of the convolution engine.
+        Read-only.
+        """
         scene = self.solution.optics.lanes(self.scenes[n] * self.uncovered(n))
         put(scene, self.solution.sky.dark[n], 0.0)
         return scene
@@ -217,10 +223,11 @@ class View:
 
 
 def return_unused_memory() -> None:
-    """Free objects without references, and return the unused heap to the system, where the C library can do this (glibc).
+    """Free objects without references, and return the unused heap to the system, where the C library can do this
+    (glibc).
 
-    A view and its fields refer to each other, so only the garbage collector frees them. The C library then keeps freed blocks of
-    up to 32 MiB for later use: after each full refit of 30 images of 512 px, 0.3 to 0.6 GiB.
+    A view and its fields refer to each other, so only the garbage collector frees them. The C library then keeps freed
+    blocks of up to 32 MiB for later use: after each full refit of 30 images of 512 px, 0.3 to 0.6 GiB.
     """
     gc.collect()
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)

@@ -14,7 +14,8 @@ from typing import Any
 
 from psfcore.errors import DataError, did_you_mean
 
-# Two wavelengths count as the same channel, and two plate scales as the same, if their ratio differs from 1 by at most this.
+# Two wavelengths count as the same channel, and two plate scales as the same, if their ratio differs from 1 by at most
+# this.
 WAVELENGTH_TOLERANCE = 0.01
 PLATE_SCALE_TOLERANCE = 0.01
 # The numbers in the table [match] may differ from those of an image by this ratio.
@@ -83,10 +84,10 @@ def assumed_in(name: str | None) -> str | None:
 def match_instrument(cards: Mapping[str, object]) -> str | None:
     """Name of the instrument whose cards in the table [match] all equal the given header cards, or None.
 
-    Several instruments may match: the file of a variant of an instrument, for one filter or plate scale, has the cards of
-    the instrument and further ones. The instrument with the most cards is chosen; of several, the first by name.
-    cards: TELESCOP, OBSRVTRY, INSTRUME, DETECTOR, FILTER, EC_FW1_ and EC_FW2_ as texts, WAVELNTH in angstrom, CDELT1 in arcsec/px.
-    `psfcore.fits.header.known_instrument` reads them from a header.
+    Several instruments may match: the file of a variant of an instrument, for one filter or plate scale, has the cards
+    of the instrument and further ones. The instrument with the most cards is chosen; of several, the first by name.
+    cards: TELESCOP, OBSRVTRY, INSTRUME, DETECTOR, FILTER, EC_FW1_ and EC_FW2_ as texts, WAVELNTH in angstrom, CDELT1 in
+    arcsec/px. `psfcore.fits.header.known_instrument` reads them from a header.
     """
     best, most = None, 0
     for name in instrument_names():

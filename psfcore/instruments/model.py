@@ -1,6 +1,7 @@
 """The instrument file (TOML): its tables and keys, checked key by key.
 
-Every key names its unit. Angles are in degrees from +x of the detector towards +y. docs/instruments.md is the reference.
+Every key names its unit. Angles are in degrees from +x of the detector towards +y. docs/instruments.md is the
+reference.
 """
 
 from __future__ import annotations
@@ -132,7 +133,8 @@ class Aperture:
             return self
         if self.sector is not None or self.obscuration_diameter_mm:
             raise ValueError(
-                "expected corners_mm alone, or a disc or ring with or without a sector; got corners_mm with another shape: "
+                "expected corners_mm alone, or a disc or ring with or without a sector; got corners_mm with another "
+                "shape: "
                 "describe opaque parts of a polygon in [mount]"
             )
         farthest = max(math.hypot(x, y) for x, y in self.corners_mm)
@@ -189,8 +191,8 @@ class Distances:
 class Mesh:
     """A mesh with square or hexagonal openings that supports a filter.
 
-    ``pitch_um``: from the centre of an opening to that of the next. ``angle_deg``: the direction of this step; in a square
-    mesh, the wires have this direction and the one across it.
+    ``pitch_um``: from the centre of an opening to that of the next. ``angle_deg``: the direction of this step; in a
+    square mesh, the wires have this direction and the one across it.
 
     ``windows``: number of windows of the diffraction series in each direction. At the entrance, this is the diameter of
     the aperture divided by the pitch; at the filter wheel, the number of windows that the light crosses.
@@ -335,8 +337,8 @@ class Scatter:
 class Instrument:
     """An instrument: all quantities from which a PSF is computed.
 
-    ``turn_deg``: the angle from the +x axis of the detector to that of the images, degrees. The angles and corners of a read
-    instrument are those on the images.
+    ``turn_deg``: the angle from the +x axis of the detector to that of the images, degrees. The angles and corners of a
+    read instrument are those on the images.
     """
 
     name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,39}$")]
@@ -368,7 +370,9 @@ class Instrument:
         return self
 
     def on_images(self) -> Instrument:
-        """The instrument as images that are turned by ``turn_deg`` show it: a direction on them is smaller by this angle."""
+        """The instrument as images that are turned by ``turn_deg`` show it: a direction on them is smaller by this
+        angle.
+        """
         if not self.turn_deg:
             return self
         meshes = tuple(replace(mesh, angle_deg=mesh.angle_deg - self.turn_deg) for mesh in self.meshes)
@@ -412,13 +416,16 @@ class Instrument:
         if self.distances is None:
             raise DataError(
                 "bad-instrument-file",
-                f"{self.name}: distances: expected this table, because mesh {mesh.name!r} is at the filter wheel; got none",
+                f"{self.name}: distances: expected this table, because mesh {mesh.name!r} is at the filter wheel; got "
+                "none",
             )
         return self.distances.filter_wheel_to_detector_mm
 
 
 def signed_area(corners: Sequence[tuple[float, float]]) -> float:
-    """The area of a polygon with these corners (x, y), in the square of their unit; above 0 if they run from +x to +y."""
+    """The area of a polygon with these corners (x, y), in the square of their unit; above 0 if they run from +x to
+    +y.
+    """
     following = (*corners[1:], corners[0])
     return sum(x0 * y1 - x1 * y0 for (x0, y0), (x1, y1) in zip(corners, following, strict=True)) / 2
 

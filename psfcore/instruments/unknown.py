@@ -18,7 +18,8 @@ from psfcore.instruments.model import load_instrument
 WAYS = (
     {
         "way": "name",
-        "text": "name a PSF: psf_id in the request, --psf ID on the command line; `heliopsf psf build --instrument NAME -o "
+        "text": "name a PSF: psf_id in the request, --psf ID on the command line; `heliopsf psf build --instrument "
+        "NAME -o "
         "PSF.fits` makes the PSF of an instrument above, and prints its id",
     },
     {
@@ -49,8 +50,8 @@ _ASK = "ask the authors for it as a FITS image, and upload it"
 class Telescope:
     """A telescope without an instrument file.
 
-    cards: an image is of this telescope if its header agrees with one of these tables. A table holds fields of the header
-    summary (`psfcore.fits.header.HeaderSummary`), and the text with which each of them begins, in any case.
+    cards: an image is of this telescope if its header agrees with one of these tables. A table holds fields of the
+    header summary (`psfcore.fits.header.HeaderSummary`), and the text with which each of them begins, in any case.
     angstrom: the wavelengths of the images that the entry describes; empty: all wavelengths. reason: why there is no
     file. ways: sentences about the steps with which a publication or a file helps; the recommended step comes first.
     """
@@ -87,7 +88,8 @@ TELESCOPES = (
         cards=({"telescop": "SOHO"}, {"instrume": "EIT"}),
         reason=_NO_SOURCE,
         ways={
-            "upload": "We found no file of its PSF. SolarSoft's eit_degrid removes the shadow of the grid near the detector: "
+            "upload": "We found no file of its PSF. SolarSoft's eit_degrid removes the shadow of the grid near the "
+            "detector: "
             "use it first, and then a PSF of your own"
         },
         angstrom=(171.0, 195.0, 284.0, 304.0),
@@ -109,12 +111,16 @@ TELESCOPES = (
         name="Hinode/XRT",
         # The X-ray telescope of Swift also has INSTRUME = 'XRT'.
         cards=({"telescop": "HINODE", "instrume": "XRT"},),
-        reason="an instrument file describes pupils and meshes, but not mirrors that reflect X-rays at grazing incidence",
+        reason="an instrument file describes pupils and meshes, but not mirrors that reflect X-rays at grazing "
+        "incidence",
         ways={
-            "upload": "SolarSoft has PSFs of XRT as FITS images in hinode/xrt/idl/util: XRT20170324_151721.0.PSF560.fits at "
-            "560 eV and XRT20170324_161721.0.PSF1000.fits at 1 keV; `heliopsf psf get xrt_560ev_2017` or xrt_1kev_2017 brings the "
+            "upload": "SolarSoft has PSFs of XRT as FITS images in hinode/xrt/idl/util: "
+            "XRT20170324_151721.0.PSF560.fits at "
+            "560 eV and XRT20170324_161721.0.PSF1000.fits at 1 keV; `heliopsf psf get xrt_560ev_2017` or "
+            "xrt_1kev_2017 brings the "
             "PSF whose energy suits the filters of the image",
-            "fit": "In images of the transit of Venus of 2012, the PSF at 560 eV removes 5 % of the light in the disc of Venus; "
+            "fit": "In images of the transit of Venus of 2012, the PSF at 560 eV removes 5 % of the light in the disc "
+            "of Venus; "
             "heliopsf can fit the remaining scatter to these images",
         },
     ),
@@ -139,7 +145,8 @@ TELESCOPES = (
         cards=({"telescop": "SDO/AIA"},),
         reason="the sources of the AIA files describe the seven EUV channels alone",
         ways={
-            "fit": "AIA observed the transit of Venus of 2012, for example at 1600 angstrom; heliopsf can fit the scatter to "
+            "fit": "AIA observed the transit of Venus of 2012, for example at 1600 angstrom; heliopsf can fit the "
+            "scatter to "
             "such images"
         },
         angstrom=(1600.0, 1700.0, 4500.0),
@@ -166,13 +173,14 @@ def channel_of(instrument: str | None, wavelength_angstrom: float | None) -> str
 
 
 def unknown_instrument(header: Mapping[str, Any], psfs: Sequence[Mapping[str, Any]] = ()) -> DataError:
-    """The error "no-psf-for-instrument" for an image with this header summary (`psfcore.fits.header.HeaderSummary` as a table).
+    """The error "no-psf-for-instrument" for an image with this header summary (`psfcore.fits.header.HeaderSummary` as a
+    table).
 
-    Its fields: `image` is the name of the telescope. `reason` says why heliopsf has no instrument file for a telescope that
-    it recognises, or which cards the header lacks; otherwise it is None. `instruments` are the instruments whose PSF can
-    be built, sorted by how well they agree with the image. `psfs` are the given PSFs, which could fit. `ways` are the steps
-    that the user can take next. For an instrument, `same` names the properties that agree with the image; `told` also says which
-    properties differ.
+    Its fields: `image` is the name of the telescope. `reason` says why heliopsf has no instrument file for a telescope
+    that it recognises, or which cards the header lacks; otherwise it is None. `instruments` are the instruments whose
+    PSF can be built, sorted by how well they agree with the image. `psfs` are the given PSFs, which could fit. `ways`
+    are the steps that the user can take next. For an instrument, `same` names the properties that agree with the image;
+    `told` also says which properties differ.
     """
     telescope = telescope_without_file(header)
     named = " ".join(str(header[key]) for key in ("telescop", "instrume", "detector") if header[key])
@@ -216,7 +224,8 @@ def _lacking(named: str, instruments: Sequence[Mapping[str, Any]], header: Mappi
     cards = header.get("cards", {})  # only summaries of files have them
     given = "".join(f"; got {key} = {cards[key]!r:.40}" for key in ("WAVELNTH", "WAVEUNIT") if key in cards)
     return (
-        "its header gives no wavelength that can be read: expected a number in the card WAVELNTH, and its unit, such as "
+        "its header gives no wavelength that can be read: expected a number in the card WAVELNTH, and its unit, such "
+        "as "
         f"angstrom or nm, in WAVEUNIT{given}"
     )
 
@@ -259,8 +268,9 @@ def _instrument(name: str, header: Mapping[str, Any]) -> dict[str, Any]:
 def agreement(
     instrument: str | None, channel: str | None, plate_scale_arcsec: float | None, header: Mapping[str, Any]
 ) -> tuple[list[str], str]:
-    """The properties that a PSF and an image have in common, of "telescope", "channel" and "plate_scale"; and a text that
-    compares both, for example "same telescope, but another channel"."""
+    """The properties that a PSF and an image have in common, of "telescope", "channel" and "plate_scale"; and a text
+    that compares both, for example "same telescope, but another channel".
+    """
     of_image, image_scale = channel_of(None, header["wavelnth"]), header["cdelt1"]
     words = set().union(*(_words(header[key]) for key in ("telescop", "instrume", "detector")))
     same, other = [], []

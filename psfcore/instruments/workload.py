@@ -33,8 +33,9 @@ MOST_ORDERS = 10_000  # of a hexagonal mesh, from the centre to the corner of th
 class Workload:
     """Sizes of the arrays for one spectral line: the line with the shortest wavelength, which needs the largest arrays.
 
-    airy_points: points of the table of the analytic pattern. cells: cells of one axis of each rotated mesh. orders:
-    of each hexagonal mesh, up to the corner. mask: whether the mask of the pupil is transformed. mount_entries: entries of the list of edges by rows of the mask.
+    airy_points: points of the table of the analytic pattern. cells: cells of one axis of each rotated mesh. orders: of
+    each hexagonal mesh, up to the corner. mask: whether the mask of the pupil is transformed. mount_entries: entries of
+    the list of edges by rows of the mask.
     """
 
     samples: float
@@ -119,6 +120,6 @@ def _cells(instrument: Instrument, mesh: Mesh, wavelength_mm: float, corner_px: 
 
 
 def _spacing_px(instrument: Instrument, mesh: Mesh, wavelength_mm: float) -> float:
-    """lambda z / d, the spacing of the orders of a square mesh, px."""
+    """Lambda z / d, the spacing of the orders of a square mesh, px."""
     reach_mm2 = wavelength_mm * instrument.mesh_distance_mm(mesh)
     return reach_mm2 / (mesh.pitch_um * MM_PER_UM) / (instrument.detector.pixel_pitch_um * MM_PER_UM)

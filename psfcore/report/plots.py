@@ -40,7 +40,7 @@ from psfcore.scatter.fit import RADII_PX, TransitFit
 from psfcore.scatter.total_psf import DIFFRACTION, SCATTER
 from psfcore.scatter.validation.cross_validation import ShellBands
 from psfcore.scatter.validation.robustness import DarkOffsetStudy
-from psfcore.tables.lookup import TOTAL
+from psfcore.tables.lookup import TOTAL, Tables
 
 WIDTH_IN = 9.9
 MOST_SLICES = 6
@@ -131,7 +131,9 @@ def _scatter_from(report: PsfReport, edges: Vector) -> Vector:
 
 
 def _draw_free(curve: Any, spread: Any, report: PsfReport, shells: ShellBands) -> None:
-    """Draw the diffuse light beyond the inner edge of each free shell within the field: median and spread of the folds."""
+    """Draw the diffuse light beyond the inner edge of each free shell within the field: median and spread of the
+    folds.
+    """
     edges = shells.edges_px[:-1]
     shown = (edges >= 1) & (edges < max(report.transit.shape))
     low_2, low_1, median, high_1, high_2 = shells.free_beyond_pct[:, shown]
@@ -146,7 +148,7 @@ def _draw_free(curve: Any, spread: Any, report: PsfReport, shells: ShellBands) -
             axes.errorbar(edges[shown], middle, span, label=label, zorder=3, **style)
 
 
-def beyond_of(tables: dict[str, Any], name: str) -> tuple[Vector, Vector, Vector]:
+def beyond_of(tables: Tables, name: str) -> tuple[Vector, Vector, Vector]:
     """Radii (px), 100 (1 - encircled energy) of a component at these radii, and its standard error (0: not known)."""
     radii = np.array(tables["radii_px"])
     encircled = np.array(tables["encircled"][name])

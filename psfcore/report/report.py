@@ -3,8 +3,8 @@
 Source: Hofmeister et al., The point-spread function of HRI_EUV, sections "Inversion results", "Accuracy and robustness"
 and "Evaluation". The PSF is fitted to all images once. The fit of every fold differs from this fit by a small step. The
 step follows from the contributions of the images to the normal equations (the shared scheme, Eq. (1) of
-`psfcore.scatter.validation.cross_validation`). There are two kinds of folds. In the cross-validation, the images of a fold
-are a bootstrap sample. In the evaluation, the fitted images of a fold count once each, and the PSF of the fold is
+`psfcore.scatter.validation.cross_validation`). There are two kinds of folds. In the cross-validation, the images of a
+fold are a bootstrap sample. In the evaluation, the fitted images of a fold count once each, and the PSF of the fold is
 evaluated on the held-out images. Only the dark offsets need new fits; these start from the fit to all images.
 
 A given PSF is evaluated without a fit. The report then lists the results that are missing because they need a fit.
@@ -80,10 +80,10 @@ class Missing:
 class PsfReport:
     """A transit, a PSF and all results about them.
 
-    tables: the tables of the PSF (`psfcore.tables.make`). fit, cross, study: None if the PSF was given; cross and study can
-    also be None for a reason that `missing` contains. held_out: whether every image was evaluated with a PSF that was
-    fitted without it. fitted_to_these: whether the PSF used in the evaluation was fitted to the same images, here or
-    according to its history.
+    tables: the tables of the PSF (`psfcore.tables.make`). fit, cross, study: None if the PSF was given; cross and study
+    can also be None for a reason that `missing` contains. held_out: whether every image was evaluated with a PSF that
+    was fitted without it. fitted_to_these: whether the PSF used in the evaluation was fitted to the same images, here
+    or according to its history.
     """
 
     transit: Transit
@@ -258,7 +258,8 @@ class _ReportProgress:
     def counted(self, name: str, visits: float) -> Progress:
         """The progress function of a stage with several fits.
 
-        The steps of each fit begin at 0 again. Therefore the calls are counted instead. visits: expected number of calls.
+        The steps of each fit begin at 0 again. Therefore the calls are counted instead. visits: expected number of
+        calls.
         """
         calls = count(1)
         return lambda stage, _step, _steps: self._tell(name, stage, next(calls) / visits)

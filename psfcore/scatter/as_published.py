@@ -1,18 +1,18 @@
 """The inversion exactly as published, and variants that each correct one of its four biases.
 
-Source: Hofmeister et al., The point-spread function of HRI_EUV, section "The inversion algorithm", steps (a) to (j). The
-steps are repeated in six rounds. Each round deconvolves the images with Richardson-Lucy, locates the occulters, sets
-their discs to zero, and fits subsets of equations. Three rounds fit free shells; then three rounds fit a softened power
-law. Where the text of the paper leaves a choice, a comment beside the constant explains the choice made here. `Choices`
-describes the four biases and their corrections.
+Source: Hofmeister et al., The point-spread function of HRI_EUV, section "The inversion algorithm", steps (a) to (j).
+The steps are repeated in six rounds. Each round deconvolves the images with Richardson-Lucy, locates the occulters,
+sets their discs to zero, and fits subsets of equations. Three rounds fit free shells; then three rounds fit a softened
+power law. Where the text of the paper leaves a choice, a comment beside the constant explains the choice made here.
+`Choices` describes the four biases and their corrections.
 
     I_o = sum over S of psf_S A_S + (1 - sum over S of n_S psf_S) B      Eq. (1)
 
-Each selected pixel gives one equation; I_o is the observed intensity of this pixel. Every equation is divided by its scale
-(see `Equations`). The coefficients psf_S are fitted to 100 random subsets of the equations. A subset contains 1000
-equations of occulted pixels and 100 equations of unocculted pixels near the edge of the disc. Each shell of the mask that
-selects the occulted pixels contributes the same number of equations. No equation occurs twice in a subset, so a subset
-is not a bootstrap sample. The 30 fits with the largest misfit are dropped, and the other 70 are averaged.
+Each selected pixel gives one equation; I_o is the observed intensity of this pixel. Every equation is divided by its
+scale (see `Equations`). The coefficients psf_S are fitted to 100 random subsets of the equations. A subset contains
+1000 equations of occulted pixels and 100 equations of unocculted pixels near the edge of the disc. Each shell of the
+mask that selects the occulted pixels contributes the same number of equations. No equation occurs twice in a subset, so
+a subset is not a bootstrap sample. The 30 fits with the largest misfit are dropped, and the other 70 are averaged.
 
     free fit        psf_S >= 0, by the Trust Region Reflective algorithm              Eq. (2)
     power law       psf_S = mean of a / (b + r)^c over S, by the same algorithm       Eq. (3)
@@ -69,7 +69,8 @@ OCCULTED_EQUATIONS = 1000
 UNOCCULTED_EQUATIONS = 100
 UNOCCULTED = -1
 LEAST_LIGHT = 1e-5
-# With this weight, a shell that contains all light has as much misfit as one equation that is wrong by 10 times its scale.
+# With this weight, a shell that contains all light has as much misfit as one equation that is wrong by 10 times its
+# scale.
 PRIOR_WEIGHT = 10.0
 PIVOT_PX = 15.0
 MOST_RINGS = 40
@@ -157,8 +158,8 @@ def choose_subset(equations: Equations, rng: np.random.Generator) -> NDArray[np.
     """Indices of one random subset of the equations; no equation occurs twice.
 
     All strata of occulted pixels contribute the same number of equations. A stratum with too few equations contributes
-    all of them. Equations of unocculted pixels follow. Raises DataError "no-lines" if there is no equation of an occulted
-    pixel.
+    all of them. Equations of unocculted pixels follow. Raises DataError "no-lines" if there is no equation of an
+    occulted pixel.
     """
     strata = np.unique(equations.stratum[equations.stratum != UNOCCULTED])
     if strata.size == 0:
@@ -201,7 +202,8 @@ def free_fit(
         light = matrix[:, used] / counts[used]
         extended = np.concatenate((light, np.diag(prior_weight[used])))
         extended_target = np.concatenate((target, (prior_weight * prior_at * counts)[used]))
-        # The triangular factor of a QR factorisation gives the same least-squares solution from a twentieth of the rows.
+        # The triangular factor of a QR factorisation gives the same least-squares solution from a twentieth of the
+        # rows.
         turned, triangle = np.linalg.qr(extended)
         solved = lsq_linear(triangle, turned.T @ extended_target, bounds=(0.0, np.inf), method="trf")
         coefficients[used] = solved.x / counts[used]
@@ -244,7 +246,8 @@ def power_law_fit(
 def _segment_mean(segments: Segments) -> Callable[[Vector], Vector]:
     """Eq. (3) averaged over the pixels of each segment, as a function of (ln weight at PIVOT_PX, ln b, c).
 
-    A segment whose pixels have more than MOST_RINGS distances is divided into as many rings, each with its mean distance.
+    A segment whose pixels have more than MOST_RINGS distances is divided into as many rings, each with its mean
+    distance.
     """
     distance, count = pixel_radii(segments.reach_grid_px)
     shell = np.searchsorted(segments.edges_px, distance, side="right") - 1
@@ -297,10 +300,10 @@ class Published:
     """The result of the published recipe.
 
     a, b_px, c: the power law of the last round. spread: standard deviations of a, b_px and c over the subsets; None if
-    fewer than two subsets were kept. total: the fraction of scattered light, summed over a square grid of grid_px pixels.
-    rounds: for each round, "free shells" or "softened power law", and 1 - encircled energy (in percent) at radii_px of the
-    total PSF, which is the scatter kernel convolved with the diffraction PSF. equations: the number of equations in the
-    last round.
+    fewer than two subsets were kept. total: the fraction of scattered light, summed over a square grid of grid_px
+    pixels. rounds: for each round, "free shells" or "softened power law", and 1 - encircled energy (in percent) at
+    radii_px of the total PSF, which is the scatter kernel convolved with the diffraction PSF. equations: the number of
+    equations in the last round.
     """
 
     a: float

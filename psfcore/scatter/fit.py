@@ -1,16 +1,17 @@
 """Fit a transit completely: the total PSF with its errors and limits, and alternative fits for comparison.
 
-Hofmeister et al., The point-spread function of HRI_EUV, sections "The inversion algorithm" and "Inversion results".
-The default is `psfcore.scatter.inversion`, which corrects the four biases of the published fit. The result also contains:
+Hofmeister et al., The point-spread function of HRI_EUV, sections "The inversion algorithm" and "Inversion results". The
+default is `psfcore.scatter.inversion`, which corrects the four biases of the published fit. The result also contains:
 - a free fit of shells without a formula,
 - other shapes, tested on held-out images,
 - the first guess,
 - on request, the unchanged published recipe, and four variants that each correct one of its biases (`as_published`).
 
-The errors follow from the photon and read noise of every pixel, propagated through the fit. A disc mean is the mean of the
-fully dark pixels of one image. The disc means can vary from image to image by more than this noise. Then chi2 divided by
-its degrees of freedom is a factor f > 1. If chance does not explain f, all errors are multiplied by sqrt(f), and the
-report says so. Such an excess shows that the model lacks an effect, and averaging more images does not remove it.
+The errors follow from the photon and read noise of every pixel, propagated through the fit. A disc mean is the mean of
+the fully dark pixels of one image. The disc means can vary from image to image by more than this noise. Then chi2
+divided by its degrees of freedom is a factor f > 1. If chance does not explain f, all errors are multiplied by sqrt(f),
+and the report says so. Such an excess shows that the model lacks an effect, and averaging more images does not remove
+it.
 
 | symbol | name | unit |
 |---|---|---|
@@ -222,7 +223,7 @@ class _FitProgress:
         self._total = frames * (visits + published * 6 * 2 * self._PUBLISHED_ROUND)
 
     def __call__(self, stage: str, step: int, steps: int) -> None:
-        first = stage.split()[0]
+        first = stage.split(maxsplit=1)[0]
         cost = self._PUBLISHED_ROUND if ":" in stage else self._ROUND
         self._done += self._COST.get(first, cost)
         self._total = max(self._total, 1.02 * self._done)
@@ -332,7 +333,8 @@ def _limits(solution: Solution, curve: Curve, factor: float) -> tuple[str, ...]:
         )
     if solution.optics.least_transfer < LEAST_TRANSFER:
         out.append(
-            "the diffraction PSF blurs so much that the images do not contain the finest structures: in simulations with such "
+            "the diffraction PSF blurs so much that the images do not contain the finest structures: in simulations "
+            "with such "
             f"PSFs, the fraction of scattered light was wrong by up to {BIAS_OF_BROAD_CORES_POINTS:g} percentage points"
         )
     short = min(solution.transit.shape)

@@ -93,7 +93,8 @@ def interpolated_shape(before: FittedShape, after: FittedShape, weight: float) -
     if (before.shape, before.parameters) != (after.shape, after.parameters):
         raise DataError(
             "shapes-differ",
-            f"expected two PSFs that were fitted with the same shape; got {before.shape} ({', '.join(before.parameters)}) "
+            f"expected two PSFs that were fitted with the same shape; got {before.shape} "
+            f"({', '.join(before.parameters)}) "
             f"and {after.shape} ({', '.join(after.parameters)}): fit both transits with the same shape "
             "(`heliopsf psf fit --shape`)",
         )
@@ -129,8 +130,8 @@ def interpolated_psf(
 
     Raises DataError: "psf-not-fitted" if a PSF has no fitted shape or no component DIFFRACTION; "psfs-differ" if the
     instruments, channels, cards, plate scales or arrays differ; "shapes-differ"; "diffraction-differs";
-    "psf-not-of-its-shape" if a PSF contains more than its fitted shape and diffraction, such as a PSF that was corrected for a
-    ghost; and the errors of `weight_at`.
+    "psf-not-of-its-shape" if a PSF contains more than its fitted shape and diffraction, such as a PSF that was
+    corrected for a ghost; and the errors of `weight_at`.
     """
     weight = weight_at(before.time, after.time, time)
     first, second = fit_of(before.psf), fit_of(after.psf)
@@ -225,7 +226,8 @@ def _check_same_telescope(before: Psf, after: Psf) -> None:
     if differ or before.kernel.shape[0] != before.kernel.shape[1]:
         raise DataError(
             "psfs-differ",
-            "expected two PSFs of the same instrument, channel, filter and plate scale, on square arrays of the same size; got "
+            "expected two PSFs of the same instrument, channel, filter and plate scale, on square arrays of the same "
+            "size; got "
             f"{'; '.join(differ) or f'arrays of {before.kernel.shape}'}: choose two PSFs of one series",
         )
 
@@ -243,7 +245,8 @@ def _check_same_diffraction(before: Psf, after: Psf) -> None:
         raise DataError(
             "diffraction-differs",
             f"expected two PSFs with the same diffraction PSF; got {before.name} {before.version} and {after.name} "
-            f"{after.version}, whose diffraction differs by {100 * moved:.3g} % of the light: fit both transits with the same "
+            f"{after.version}, whose diffraction differs by {100 * moved:.3g} % of the light: fit both transits with "
+            "the same "
             "diffraction PSF",
         )
 
@@ -253,7 +256,9 @@ def _check_of_its_shape(psf: Psf, model: Kernel) -> None:
     if moved > SAME_LIGHT:
         raise DataError(
             "psf-not-of-its-shape",
-            f"expected a PSF that is its fitted shape convolved with its diffraction PSF; got {psf.name} {psf.version}, which "
-            f"differs from that by {100 * moved:.3g} % of the light, for example because it contains a corrected effect: "
+            f"expected a PSF that is its fitted shape convolved with its diffraction PSF; got {psf.name} "
+            f"{psf.version}, which "
+            f"differs from that by {100 * moved:.3g} % of the light, for example because it contains a corrected "
+            "effect: "
             "name a PSF for the image instead (--psf)",
         )

@@ -1,20 +1,21 @@
 """Fit diffuse scatter to a transit: find the PSF for which the occulter is dark.
 
-Source: Hofmeister et al., The point-spread function of HRI_EUV, section "The inversion algorithm", steps (a) to (j). Here
-the four biases of the published fit are corrected. One non-linear least-squares problem replaces the paper's rounds.
+Source: Hofmeister et al., The point-spread function of HRI_EUV, section "The inversion algorithm", steps (a) to (j).
+Here the four biases of the published fit are corrected. One non-linear least-squares problem replaces the paper's
+rounds.
 
-H(q) is the convolution with the total PSF on the field. D selects the fully dark pixels. x(q) = H(q)^-1 y is the scene of
-an image y:
+H(q) is the convolution with the total PSF on the field. D selects the fully dark pixels. x(q) = H(q)^-1 y is the scene
+of an image y:
 
     r(q) = D [y - H(q) (1 - D) x(q)]                                  Eq. (1)
     minimise over q   sum over images and dark pixels of r^2 / v      Eq. (2)
     v = variance of photon and read noise at the model's intensity    Eq. (3)
     dr/dq = -D [(dH/dq) (1 - D) x - H (1 - D) G (dH/dq) x]            Eq. (4)
 
-The paper alternates: steps (d) and (f) find the scene for a fixed PSF, steps (h) and (i) find the PSF for a fixed scene.
-Eq. (4) contains both effects of a change of the PSF: it changes the light that the scene scatters into the disc, and it
-changes the scene. Gauss-Newton steps with Eq. (4) converge in three or four rounds, whereas the alternation needs six or
-more. The normal matrix of the steps also gives the error of the fit.
+The paper alternates: steps (d) and (f) find the scene for a fixed PSF, steps (h) and (i) find the PSF for a fixed
+scene. Eq. (4) contains both effects of a change of the PSF: it changes the light that the scene scatters into the disc,
+and it changes the scene. Gauss-Newton steps with Eq. (4) converge in three or four rounds, whereas the alternation
+needs six or more. The normal matrix of the steps also gives the error of the fit.
 
 Differences from the paper; the benefit of each was measured on simulated transits:
 - The weight of a pixel follows from the expected intensity, not from the observed intensity, Eq. (3).
@@ -90,10 +91,10 @@ def invert(
     """Fit a shape of scatter to a transit.
 
     start: coordinates at which the fit starts; default: shape.start. near: True if these coordinates come from a fit to
-    nearly the same images. Then the fit does not begin with a pilot fit to a few images. The occulters are located again
-    only if the fit does not converge, or if C(R) changes by 0.3 percentage points or more. counts: how many times each
-    image counts; default: once. An image with count 0 is held out of the fit, but it still helps to locate the occulters
-    of its neighbours in time.
+    nearly the same images. Then the fit does not begin with a pilot fit to a few images. The occulters are located
+    again only if the fit does not converge, or if C(R) changes by 0.3 percentage points or more. counts: how many times
+    each image counts; default: once. An image with count 0 is held out of the fit, but it still helps to locate the
+    occulters of its neighbours in time.
 
     Raises DataError "too-few-frames" if fewer than three frames contain an occulter, and "transit-says-too-little" if
     the frames do not determine all parameters.
@@ -304,7 +305,9 @@ class _Solver:
         return at
 
     def _step(self, measured: dict[int, _Measured]) -> tuple[Vector, bool]:
-        """The Gauss-Newton step, shortened if it exceeds the largest step of a parameter; True if it was not shortened."""
+        """The Gauss-Newton step, shortened if it exceeds the largest step of a parameter; True if it was not
+        shortened.
+        """
         normal = self._normal(measured)
         score = np.sum([self._counts[n] * m.score for n, m in measured.items()], axis=0)
         return self._total.shape.shortened(np.linalg.solve(normal, score))
@@ -343,7 +346,9 @@ class _Solver:
         return dict(zip(frames, results, strict=True))
 
     def _measure_one(self, model: _Model, n: int, kept: _Measured | None) -> _Measured:
-        """Compute Eq. (1) for one image. If `kept` is given, reuse its weights and Jacobian; otherwise compute Eq. (3) and (4)."""
+        """Compute Eq. (1) for one image. If `kept` is given, reuse its weights and Jacobian; otherwise compute Eq. (3)
+        and (4).
+        """
         images = model.images
         self._sky.improve(n, images.optics, WARM_STEPS)  # step (d)
         residual, expected = images.residual(n)  # step (f)
@@ -423,6 +428,7 @@ def _check_determined(normal: Matrix, shape: Shape) -> None:
     if weakest < WEAKEST_DIRECTION:
         raise DataError(
             "transit-says-too-little",
-            f"expected frames that determine {', '.join(shape.names)}; got frames that leave a combination of them undetermined; "
+            f"expected frames that determine {', '.join(shape.names)}; got frames that leave a combination of them "
+            "undetermined; "
             "add images at other distances from the limb, or fit a shape with fewer parameters",
         )

@@ -74,7 +74,9 @@ def fit_figure(fit: TransitFit) -> Figure:
 
 
 def _draw_weights(axes: Any, fit: TransitFit) -> None:
-    """Draw the weight per pixel by distance: the fitted shape with its error, the free shells, the published power law."""
+    """Draw the weight per pixel by distance: the fitted shape with its error, the free shells, the published power
+    law.
+    """
     radius, weight, sigma_of_log = _fitted_weights(fit)
     field_px = max(fit.transit.shape)
     if fit.free is not None:
@@ -244,7 +246,8 @@ def cross_validation_png(
 
 def _draw_shells(charts: Sequence[Any], shells: ShellBands) -> None:
     """Compare the free fits with the formula: weight per pixel, 1 - encircled energy of the scatter, and the excess
-    within each distance (light of the free fits minus light of the formula) with its error."""
+    within each distance (light of the free fits minus light of the formula) with its error.
+    """
     weights, light, excess = charts
     middle = np.sqrt(shells.edges_px[1:] * shells.edges_px[:-1])
     draw_weights_of_shells(weights, shells.edges_px, shells.free_weight, np.inf, _FREE)

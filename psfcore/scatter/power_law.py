@@ -4,8 +4,8 @@ Hofmeister et al., The point-spread function of HRI_EUV, section "The diffuse sc
 
     s(r) = a / (b + r)^c  for r > 0,   s(0) = 1 - total,   total = sum over r > 0 on the full reach    Eq. (1)
 
-A sum of laws gives each its share of `total`. A table gives s(r) at some radii, up to a factor. Between them, log s is linear
-in log r; s is constant within the first radius and 0 beyond the last.
+A sum of laws gives each its share of `total`. A table gives s(r) at some radii, up to a factor. Between them, log s is
+linear in log r; s is constant within the first radius and 0 beyond the last.
 
 The amplitude a follows from `total`, which is summed over the grid of 2048 x 2048 px. This grid reaches to 1448 px.
 
@@ -46,7 +46,9 @@ def scatter_kernel(b_px: float, c: float, total: float, size: int) -> NDArray[np
 
 
 def described_kernel(scatter: Scatter, size: int) -> NDArray[np.float64]:
-    """The kernel of the table [scatter] of an instrument file, shape (size, size); the sum is that of `scatter_kernel`."""
+    """The kernel of the table [scatter] of an instrument file, shape (size, size); the sum is that of
+    `scatter_kernel`.
+    """
     if scatter.table:
         kernel = _tabulated(scatter.table, size)
         whole, middle = _tabulated(scatter.table, REACH_GRID_PX), REACH_GRID_PX // 2

@@ -49,8 +49,9 @@ def on_threads(
 ) -> list[Result]:
     """work(tool, n) for each number, on as many threads as there are tools; no two threads use a tool at the same time.
 
-    Images are computed beside each other, because one image keeps several threads busy only in its transforms. told(step) is
-    called before each result is waited for; if it raises an exception, the images that are left are not computed.
+    Images are computed beside each other, because one image keeps several threads busy only in its transforms.
+    told(step) is called before each result is waited for; if it raises an exception, the images that are left are not
+    computed.
     """
     free: SimpleQueue[Tool] = SimpleQueue()
     for tool in tools:
@@ -79,8 +80,8 @@ def on_threads(
 class TransitScenes:
     """The latest scenes of all images of a transit, and the positions of their occulters.
 
-    Scenes are stored in the memory order of the convolution engine (see `psfcore.scatter.total_psf`). Images are not, because a
-    second copy of them would take a third of the memory of a fit.
+    Scenes are stored in the memory order of the convolution engine (see `psfcore.scatter.total_psf`). Images are not,
+    because a second copy of them would take a third of the memory of a fit.
     """
 
     transit: Transit
@@ -104,8 +105,8 @@ class TransitScenes:
     def improve(self, n: int, optics: Optics, steps: int) -> None:
         """Step (d) again: continue from the scene of image n for some steps.
 
-        If the PSF has little power at some frequencies, each step restores more of them and amplifies their noise more. Then
-        the reconstruction begins again, so that the scene does not depend on the number of rounds.
+        If the PSF has little power at some frequencies, each step restores more of them and amplifies their noise more.
+        Then the reconstruction begins again, so that the scene does not depend on the number of rounds.
         """
         observed = optics.lanes(self.transit.frames[n].pixels)
         if optics.least_transfer >= SETTLING_TRANSFER:
@@ -174,8 +175,8 @@ def dark_pixels(frame: Frame, found: FoundPlace) -> Pixels:
 class Reconstruction:
     """A transit reconstructed with one PSF: its scenes, its dark pixels, and the residuals there.
 
-    total: computes total PSFs. optics: convolution with the fitted total PSF. sky: scenes and dark pixels of all images.
-    part: indices of the images to which the PSF was fitted.
+    total: computes total PSFs. optics: convolution with the fitted total PSF. sky: scenes and dark pixels of all
+    images. part: indices of the images to which the PSF was fitted.
     """
 
     transit: Transit
@@ -196,7 +197,9 @@ class Reconstruction:
         return [replace(self, optics=optics) for optics in self.optics.twins()]
 
     def residual(self, n: int) -> tuple[Vector, Vector]:
-        """Observed minus expected intensity of the dark pixels of image n, r of Eq. (1), and the expected intensity, DN/s."""
+        """Observed minus expected intensity of the dark pixels of image n, r of Eq. (1), and the expected intensity,
+        DN/s.
+        """
         expected = pick(self.optics.convolve(self.blanked_scene(n)), self.sky.dark[n])
         return self.observed(n) - expected, expected
 
@@ -205,12 +208,16 @@ class Reconstruction:
         return self.transit.frames[n].pixels[self.sky.dark[n]].astype(np.float64)
 
     def weight(self, n: int, expected: Vector) -> Vector:
-        """The inverse of the variance of Eq. (3) for the dark pixels of image n with the intensities `expected` (DN/s)."""
+        """The inverse of the variance of Eq. (3) for the dark pixels of image n with the intensities `expected`
+        (DN/s).
+        """
         level = np.maximum(expected, LEAST_LEVEL * expected.mean())
         return np.asarray(1 / self.transit.noise.variance(level, self.transit.frames[n].exposure_s))
 
     def jacobian(self, n: int, slope: Blur) -> Vector:
-        """The derivative of the expected light in the dark pixels of image n, from Eq. (4). slope: derivative of the total PSF."""
+        """The derivative of the expected light in the dark pixels of image n, from Eq. (4). slope: derivative of the
+        total PSF.
+        """
         dark = self.sky.dark[n]
         changed = slope.convolve(self.blanked_scene(n))
         scene = self.optics.invert_once(changed)

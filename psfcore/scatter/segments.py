@@ -1,26 +1,27 @@
 """Segments of the PSF: concentric shells, each with one coefficient, and sums of an image over them.
 
-Source: Hofmeister et al., The point-spread function of HRI_EUV, "The inversion algorithm", steps (c) and (h). A segment S is
-a set of offsets dr = target - source: light from a source falls on target = source + dr. A pixel belongs to segment k if
-edges[k] <= r < edges[k + 1]. The central pixel belongs to no segment: its weight is 1 minus the light of all segments.
+Source: Hofmeister et al., The point-spread function of HRI_EUV, "The inversion algorithm", steps (c) and (h). A segment
+S is a set of offsets dr = target - source: light from a source falls on target = source + dr. A pixel belongs to
+segment k if edges[k] <= r < edges[k + 1]. The central pixel belongs to no segment: its weight is 1 minus the light of
+all segments.
 
     n_S = number of pixels of S on the reach grid                                            Eq. (1)
     psf_S = (1 / n_S) sum over dr in S of f(dr)                                              Eq. (2)
     A_S[r] = sum over dr in S of I[r - dr]                                                   Eq. (3)
 
-for targets r, with I = 0 beyond the image. In each row, a segment consists of a few runs of adjacent pixels. Running sums
-P along the rows of the image are computed first. Each run then costs one difference, independent of its length:
+for targets r, with I = 0 beyond the image. In each row, a segment consists of a few runs of adjacent pixels. Running
+sums P along the rows of the image are computed first. Each run then costs one difference, independent of its length:
 
     P[y, i] = sum over x < i of I[y, x]                                                      Eq. (4)
     sum over dx_start <= dx < dx_stop of I[y, x - dx] = P[y, x - dx_start + 1] - P[y, x - dx_stop + 1]    Eq. (5)
 
-Targets are grouped into strips of up to 24 adjacent pixels of a row. The targets of a strip read adjacent values of P, so
-the sums of a strip are vector operations. Image rows are processed four at a time. Their running sums stay in the cache
-while all strips use them.
+Targets are grouped into strips of up to 24 adjacent pixels of a row. The targets of a strip read adjacent values of P,
+so the sums of a strip are vector operations. Image rows are processed four at a time. Their running sums stay in the
+cache while all strips use them.
 
-Difference from the paper: about the innermost shells, the paper gives only their number, ten, and their outer edge, 5 px.
-There are only twelve different pixel distances below 5 px, so four of ten shells of equal width would be empty. Here each
-of the ten shells contains one or two of these distances.
+Difference from the paper: about the innermost shells, the paper gives only their number, ten, and their outer edge, 5
+px. There are only twelve different pixel distances below 5 px, so four of ten shells of equal width would be empty.
+Here each of the ten shells contains one or two of these distances.
 
 | symbol | name | unit |
 |---|---|---|
@@ -102,7 +103,9 @@ class Segments:
 
     @cached_property
     def counts(self) -> NDArray[np.int64]:
-        """The number of pixels of each segment, n_S of Eq. (1), (size,). It is 0 for a shell that is too narrow to contain a pixel."""
+        """The number of pixels of each segment, n_S of Eq. (1), (size,). It is 0 for a shell that is too narrow to
+        contain a pixel.
+        """
         label = self._reach_map.ravel()
         return np.bincount(label + 1, minlength=self.size + 1)[1:]
 
@@ -166,8 +169,8 @@ def segment_sums(
 
     The sums are in the image's unit times px^2, exact to float64 rounding.
 
-    image: [y, x], float32 or float64; it is taken as 0 beyond its edges. targets: (n, 2), the (y, x) of each target on the
-    image, in any order. threads: number of threads that share the targets; it does not change the result. Raises
+    image: [y, x], float32 or float64; it is taken as 0 beyond its edges. targets: (n, 2), the (y, x) of each target on
+    the image, in any order. threads: number of threads that share the targets; it does not change the result. Raises
     DataError "image-nonfinite" if a pixel is NaN or infinite, and ValueError if a target lies outside the image.
     """
     if not ((targets >= 0) & (targets < image.shape)).all():
@@ -210,7 +213,9 @@ def segment_sums(
 
 @compiled()
 def _strips(targets):  # type: ignore[no-untyped-def]
-    """Index of the strip of each target, and (y, x) of the first pixel of each strip. Targets are sorted by y, then x."""
+    """Index of the strip of each target, and (y, x) of the first pixel of each strip. Targets are sorted by y, then
+    x.
+    """
     strip = np.empty(len(targets), np.int64)
     first = np.empty((len(targets), 2), np.int64)
     count = 0

@@ -13,11 +13,12 @@ is scaled so that its weights outside the central pixel sum to `total` on the fu
     two power laws                Eq. (2) + a second power law, (b_2 + r)^-c           Eq. (6)
     core                          Eq. (2) + a Gaussian                                 Eq. (7)
 
-For Eq. (3), a stretch by the factor 1 + s along the angle t corresponds to ln(1 + s) = hypot(p, q) and 2 t = atan2(q, p).
-At zero stretch the angle is not defined, but the kernel is a smooth function of p and q. In Eq. (4), t is the direction of
-d. In Eq. (6) and (7), the second term contains a fraction of `total` (halo_share, core_share).
+For Eq. (3), a stretch by the factor 1 + s along the angle t corresponds to ln(1 + s) = hypot(p, q) and 2 t = atan2(q,
+p). At zero stretch the angle is not defined, but the kernel is a smooth function of p and q. In Eq. (4), t is the
+direction of d. In Eq. (6) and (7), the second term contains a fraction of `total` (halo_share, core_share).
 
-The fit uses unbounded coordinates instead of the parameters: the logarithm of a positive number, the logit of a fraction.
+The fit uses unbounded coordinates instead of the parameters: the logarithm of a positive number, the logit of a
+fraction.
 
 | symbol | name | unit |
 |---|---|---|
@@ -78,7 +79,8 @@ class Parameter:
         if self.scale != "linear" and not abs(coordinate) < FARTHEST:
             raise DataError(
                 "transit-says-too-little",
-                f"expected images that determine {self.name}; the fit left the range of its values: add images, or fit a shape "
+                f"expected images that determine {self.name}; the fit left the range of its values: add images, or "
+                "fit a shape "
                 "with fewer parameters",
             )
         if self.scale == "log":
@@ -175,7 +177,9 @@ class Shape:
         return crop_centred(scaled, (size, size))
 
     def slope(self, coordinates: Vector, k: int, size: int) -> Kernel:
-        """The derivative of the kernel with respect to coordinate k, [y, x] on (size, size), from central differences."""
+        """The derivative of the kernel with respect to coordinate k, [y, x] on (size, size), from central
+        differences.
+        """
         step = np.zeros_like(coordinates)
         step[k] = DIFFERENCE
         ahead, behind = (self.kernel(coordinates + side * step, size) for side in (1, -1))
@@ -277,7 +281,9 @@ def stretch_of(values: Values) -> tuple[float, float]:
 
 @cache
 def pixel_radii(size: int) -> tuple[Vector, Vector]:
-    """The distinct radii of the pixels of a (size, size) square, in ascending order, and the number of pixels at each."""
+    """The distinct radii of the pixels of a (size, size) square, in ascending order, and the number of pixels at
+    each.
+    """
     squares, count = np.unique(squared_radii((size, size)), return_counts=True)
     return np.sqrt(squares), count.astype(np.float64)
 

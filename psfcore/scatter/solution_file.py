@@ -8,7 +8,7 @@ made. The PSF at the solution is computed from the coordinates.
 |---|---|
 | contents | everything that is no array, as JSON |
 | coordinates, covariance, curve_pct, curve_sigma | fields of Inversion |
-| observed, expected, noise, chi2, normal, score, mean_jacobian | fields of FrameFit, first axis: the frames of the fit |
+| observed, expected, noise, chi2, normal, score, mean_jacobian | fields of FrameFit; first axis: frames of the fit |
 | scene-0000, ... | the scene of each frame of the transit, in the engine's order |
 | dark-0000, ... | rows and columns of the dark pixels of each frame of the transit, (2, pixels) |
 """

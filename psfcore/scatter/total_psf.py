@@ -1,6 +1,8 @@
-"""The total PSF, its derivatives, and its effect on one field: convolution, inverse, and the noise that passes through both.
+"""The total PSF, its derivatives, and its effect on one field: convolution, inverse, and the noise that passes through
+both.
 
-Scattered light is diffracted too, so the total PSF is the convolution of the two. On the full reach, both kernels sum to
+Scattered light is diffracted too, so the total PSF is the convolution of the two. On the full reach, both kernels sum
+to
 1. The sum of their convolution differs from 1 only by a small amount of light that falls beyond the grid.
 
 The uncertainty of a fitted PSF is represented by sample PSFs: the sigma points of the covariance (Julier and Uhlmann
@@ -24,8 +26,8 @@ residual in the disc is then r = D [y - H (1 - D) G y]. The sum of the residual 
     t . r = b . n + (t . r without noise),   b = t - G^T (1 - D) H^T t                Eq. (3)
     cov(t_1 . r, t_2 . r) = sum over all pixels of b_1 b_2 var(n)                     Eq. (4)
 
-The first term of b describes the noise of the disc's pixels. The second term describes the noise of the estimated scene,
-which the model scatters into the disc.
+The first term of b describes the noise of the disc's pixels. The second term describes the noise of the estimated
+scene, which the model scatters into the disc.
 
 | symbol | name |
 |---|---|
@@ -207,8 +209,8 @@ class Blur:
 class Optics(Blur):
     """Convolution with a PSF, and its approximate inverse.
 
-    least_transfer: the smallest absolute value of the PSF's Fourier transform. Eq. (1) converges at once where it is at least
-    LEAST_TRANSFER of `psfcore.deconvolve.iterations.linear`, and slowly where it is smaller.
+    least_transfer: the smallest absolute value of the PSF's Fourier transform. Eq. (1) converges at once where it is at
+    least LEAST_TRANSFER of `psfcore.deconvolve.iterations.linear`, and slowly where it is smaller.
     """
 
     def __init__(self, psf_kernel: Kernel, field_shape: tuple[int, int], *, threads: int = 1) -> None:
@@ -221,7 +223,9 @@ class Optics(Blur):
         return self._through(lanes, self._inverse, conjugate=adjoint)
 
     def invert(self, observed: Lanes, start: Lanes | None = None, *, steps: int = STEPS) -> Lanes:
-        """The scene x of an observation, from `steps` iterations of Eq. (1). start: first estimate (default: observed)."""
+        """The scene x of an observation, from `steps` iterations of Eq. (1). start: first estimate (default:
+        observed).
+        """
         first = observed if start is None else start
         return solve_linear(self.engine, self._inverse, observed, first, steps)  # Eq. (1)
 
@@ -257,8 +261,8 @@ def noise_covariance(
     observed = frame.pixels.ravel()
     for first in range(0, observed.size, BLOCK_PX):
         part = b[:, first : first + BLOCK_PX]
-        # The variance is a linear function of the expected pixel value. The observed value can replace the expected value
-        # here, because the noise of the observed values averages out in the sum over the pixels.
+        # The variance is a linear function of the expected pixel value. The observed value can replace the expected
+        # value here, because the noise of the observed values averages out in the sum over the pixels.
         variance = noise.variance(observed[first : first + BLOCK_PX].astype(np.float64), frame.exposure_s)
         covariance += (part * variance.astype(np.float32)) @ part.T  # Eq. (4)
     return covariance

@@ -218,14 +218,16 @@ def _inverse(information: Plane) -> Plane:
     if np.linalg.cond(correlation) > 1 / np.finfo(np.float64).eps:
         raise DataError(
             "no-bound",
-            "expected dark pixels that distinguish the parameters; got a singular matrix. Use more images or larger discs",
+            "expected dark pixels that distinguish the parameters; got a singular matrix. Use more images or larger "
+            "discs",
         )
     return np.asarray(np.linalg.inv(correlation) / np.outer(scale, scale))
 
 
 def _window(sky: TrueSky, index: int) -> Window:
     """The part of the field around the occulter, as slices. It contains all pixels from which the position is
-    measured."""
+    measured.
+    """
     place, size = sky.plan.place(index), sky.plan.size_px
     half = int(np.ceil(place.radius_px + PLACE_MARGIN_PX)) + 1
     row, column = int(np.rint(place.y_px)), int(np.rint(place.x_px))

@@ -4,9 +4,9 @@ A plan states when, where and for how long images are taken. Three kinds of file
 
 - a plan as JSON, as `Plan.as_json` returns it (`size_px`, `shots`, ...);
 - truth.json of a simulated transit, which contains such a plan;
-- transit.json, or a folder with it. Exposure times, gain modes, times and the size of the images come from the headers of the
-  images. If there are no images yet, transit.json states them: `size_px`, and `exposure_s`, `gain_mode` and `time_s` of each
-  image. `views` then says what each pointing shows.
+- transit.json, or a folder with it. Exposure times, gain modes, times and the size of the images come from the headers
+  of the images. If there are no images yet, transit.json states them: `size_px`, and `exposure_s`, `gain_mode` and
+  `time_s` of each image. `views` then says what each pointing shows.
 """
 
 from __future__ import annotations
@@ -71,7 +71,8 @@ def read_plan(path: str | Path, limits: FitsLimits) -> PlanFile:
     if not file.is_file():
         raise DataError(
             "no-manifest",
-            f"expected a plan, or a folder with {MANIFEST_NAME}; {path} has no {MANIFEST_NAME}: add it, or name the file of a plan",
+            f"expected a plan, or a folder with {MANIFEST_NAME}; {path} has no {MANIFEST_NAME}: add it, or name the "
+            "file of a plan",
         )
     with file.open("rb") as source:
         text = source.read(MAX_MANIFEST_BYTES + 1)
@@ -102,7 +103,8 @@ def _checked(plan: Plan, name: str) -> Plan:
     for number, shot in enumerate(plan.shots):
         if not (math.isfinite(shot.exposure_s) and math.isfinite(shot.time_s)):
             raise _bad(
-                f"{name}: image {number}: expected a finite exposure and time; got {shot.exposure_s} s and {shot.time_s} s"
+                f"{name}: image {number}: expected a finite exposure and time; got {shot.exposure_s} s and "
+                f"{shot.time_s} s"
             )
     return plan
 
@@ -176,7 +178,8 @@ def _size_of_manifest(content: Mapping[str, Any]) -> int:
     size = content.get("size_px")
     if not isinstance(size, int) or isinstance(size, bool):
         raise _bad(
-            f"{MANIFEST_NAME}: expected the images in the folder or, without them, `size_px` (their width and height in px); "
+            f"{MANIFEST_NAME}: expected the images in the folder or, without them, `size_px` (their width and height "
+            "in px); "
             f"got {size!r:.60}"
         )
     return size
@@ -192,11 +195,13 @@ def _exposures_of_manifest(images: Sequence[Mapping[str, Any]]) -> list[tuple[fl
         label = f"{MANIFEST_NAME}: images[{number}]"
         if not _is_number(exposure_s):
             raise _bad(
-                f"{label}: expected the images in the folder or, without them, `exposure_s` of each image; got {exposure_s!r:.60}"
+                f"{label}: expected the images in the folder or, without them, `exposure_s` of each image; got "
+                f"{exposure_s!r:.60}"
             )
         if not _is_number(time_s) or not isinstance(gain_mode, str):
             raise _bad(
-                f"{label}: expected a number as `time_s` and a text as `gain_mode`; got {time_s!r:.60} and {gain_mode!r:.60}"
+                f"{label}: expected a number as `time_s` and a text as `gain_mode`; got {time_s!r:.60} and "
+                f"{gain_mode!r:.60}"
             )
         rows.append((float(exposure_s), gain_mode.lower(), float(time_s)))
     return rows
@@ -217,7 +222,8 @@ def _views(content: Mapping[str, Any], count: int) -> tuple[str, ...]:
         return VIEWS if count == len(VIEWS) else (DISC,) * count
     if not isinstance(views, list) or len(views) != count or not set(map(str, views)) <= set(VIEWS):
         raise _bad(
-            f"{MANIFEST_NAME}: expected `views` with one of {', '.join(VIEWS)} for each of the {count} pointings; got {views!r:.120}"
+            f"{MANIFEST_NAME}: expected `views` with one of {', '.join(VIEWS)} for each of the {count} pointings; got "
+            f"{views!r:.120}"
         )
     return tuple(views)
 
@@ -245,8 +251,8 @@ def diffraction_kernel(
 def scenes_from_files(files: Sequence[Path], plan: Plan, limits: FitsLimits) -> dict[int, Plane] | None:
     """A scene for each pointing; the keys are the pointings' numbers. None if ``files`` is empty.
 
-    A single image serves for all pointings; for the west limb it is mirrored. Otherwise ``files`` contains one image for
-    each pointing. Raises DataError "scene-count", "bad-scene".
+    A single image serves for all pointings; for the west limb it is mirrored. Otherwise ``files`` contains one image
+    for each pointing. Raises DataError "scene-count", "bad-scene".
     """
     if not files:
         return None

@@ -1,10 +1,9 @@
 """The plan of a simulated transit: the occulter's position and the exposure of each image, and the errors.
 
 The default plan follows Hofmeister et al., The point-spread function of HRI_EUV, section "The observations". There are
-three pointings. In the first, the planet approaches the Sun's east limb. In the second, it crosses the solar disc. In the
-third, it moves away from the west limb. While the planet is far from the limb, exposures
-last 5 s in combined gain. Near the limb they last 0.9 s in high gain. In front of the solar disc they last 1.8 s in high
-gain.
+three pointings. In the first, the planet approaches the Sun's east limb. In the second, it crosses the solar disc. In
+the third, it moves away from the west limb. While the planet is far from the limb, exposures last 5 s in combined gain.
+Near the limb they last 0.9 s in high gain. In front of the solar disc they last 1.8 s in high gain.
 """
 
 from __future__ import annotations
@@ -39,7 +38,9 @@ _KEYS = {"pointing": "fov"}  # names of Shot's fields that differ in truth.json
 
 @dataclass(frozen=True)
 class Shot:
-    """One image: number of its pointing (from 1), exact centre of the occulter, exposure time, gain mode, start time."""
+    """One image: number of its pointing (from 1), exact centre of the occulter, exposure time, gain mode, start
+    time.
+    """
 
     pointing: int
     x_px: float
@@ -53,11 +54,11 @@ class Shot:
 class Plan:
     """Everything that determines a simulated transit except the PSF and the seed.
 
-    views: one of VIEWS for each pointing, in the order of their numbers. ephemeris_error_px: rms error of the
-    reported position along each axis. saturation_dn: level at which high-only images clip; None: no saturation. Combined
-    images do not saturate. brightness: factor by which the scenes are multiplied. oversampling: number of scene pixels
-    in a detector pixel along each axis, 1 or 2. beyond: "dark" if the scene ends at the edge of the field; "on" if the
-    Sun continues for beyond_px on each side (None: half the field). Raises DataError "bad-plan".
+    views: one of VIEWS for each pointing, in the order of their numbers. ephemeris_error_px: rms error of the reported
+    position along each axis. saturation_dn: level at which high-only images clip; None: no saturation. Combined images
+    do not saturate. brightness: factor by which the scenes are multiplied. oversampling: number of scene pixels in a
+    detector pixel along each axis, 1 or 2. beyond: "dark" if the scene ends at the edge of the field; "on" if the Sun
+    continues for beyond_px on each side (None: half the field). Raises DataError "bad-plan".
     """
 
     size_px: int

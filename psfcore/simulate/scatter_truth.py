@@ -133,7 +133,7 @@ def _falloff(scatter: ScatterTruth) -> Kernel:
 
 
 def _radius(scatter: ScatterTruth) -> Kernel:
-    """r' of Eq. (2)."""
+    """R' of Eq. (2)."""
     along, across = _offsets(scatter.angle_deg)
     factor = 1 + scatter.stretch
     return np.asarray(np.sqrt((along / factor) ** 2 + (across * factor) ** 2))
@@ -147,7 +147,7 @@ def _radius_slope(scatter: ScatterTruth, radius: Kernel) -> Kernel:
 
 
 def _offsets(angle_deg: float) -> tuple[Kernel, Kernel]:
-    """u and v of each pixel of the full reach."""
+    """U and v of each pixel of the full reach."""
     axis = np.arange(REACH_GRID_PX, dtype=np.float64) - REACH_GRID_PX // 2
     x, y = axis[None, :], axis[:, None]
     cos, sin = np.cos(np.deg2rad(angle_deg)), np.sin(np.deg2rad(angle_deg))

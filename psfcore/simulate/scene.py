@@ -1,11 +1,11 @@
 """A synthetic EUV scene of the Sun, with realistic contrasts and spatial scales.
 
-All lengths are in units of the field's longer edge ("field edges" below), so that a scene looks the same at any size. The
-default scene shows quiet Sun, two active regions with bright moss and thin loops, a dark coronal hole, a filament and a
-limb. The quiet Sun is lognormal and has structure on many scales. The brightness of the corona decreases with height. A
-layout chooses the limb, the corona, the active regions and the filament, and their positions. A margin extends the scene
-beyond the field. `drawn_scene` gives the scene of a pointing of a transit, and `scene_from_image` takes it from an image. `observe` convolves a scene with a PSF
-and adds photon noise and read noise.
+All lengths are in units of the field's longer edge ("field edges" below), so that a scene looks the same at any size.
+The default scene shows quiet Sun, two active regions with bright moss and thin loops, a dark coronal hole, a filament
+and a limb. The quiet Sun is lognormal and has structure on many scales. The brightness of the corona decreases with
+height. A layout chooses the limb, the corona, the active regions and the filament, and their positions. A margin
+extends the scene beyond the field. `drawn_scene` gives the scene of a pointing of a transit, and `scene_from_image`
+takes it from an image. `observe` convolves a scene with a PSF and adds photon noise and read noise.
 """
 
 from __future__ import annotations
@@ -69,9 +69,9 @@ _REGIONS = (_Region(0.78, 0.24, 0.13, 2300.0, 34), _Region(0.44, 0.31, 0.075, 18
 class Layout:
     """The parts of a scene; lengths in field edges.
 
-    limb_centre, limb_radius: (x, y) and radius of the solar disc. corona_dn_per_s: brightness of the corona at the limb.
-    corona_height: scale height of the corona. sky_dn_per_s: background that is added everywhere. regions: the active
-    regions. filament: whether there is a filament.
+    limb_centre, limb_radius: (x, y) and radius of the solar disc. corona_dn_per_s: brightness of the corona at the
+    limb. corona_height: scale height of the corona. sky_dn_per_s: background that is added everywhere. regions: the
+    active regions. filament: whether there is a filament.
     """
 
     limb_centre: tuple[float, float] = (1.52, 0.30)
@@ -98,7 +98,9 @@ _LAYOUTS = {EAST: _LIMB, DISC: _DISC, WEST: _LIMB}
 
 @dataclass(frozen=True)
 class _Canvas:
-    """The array of a scene: its shape with margins, the longer edge of the field, the margin on each side; all in px."""
+    """The array of a scene: its shape with margins, the longer edge of the field, the margin on each side; all in
+    px.
+    """
 
     shape: tuple[int, int]
     edge: int
@@ -111,7 +113,7 @@ class _Canvas:
         return self.shape[0] * self.shape[1] / inner
 
     def coordinates(self) -> tuple[Plane, Plane]:
-        """x and y of each pixel in field edges."""
+        """X and y of each pixel in field edges."""
         y, x = np.mgrid[: self.shape[0], : self.shape[1]]
         return (x - self.margin) / self.edge, (y - self.margin) / self.edge
 
@@ -183,8 +185,8 @@ def scene_from_image(image: Plane, plan: Plan) -> Plane:
 def _octaves(canvas: _Canvas, rng: np.random.Generator, *, slope: float, coarsest: float) -> Plane:
     """Gaussian noise with structure on many scales: mean 0, rms 1.
 
-    The noise is a sum of smooth random planes. Each plane has half the scale of the previous one, down to one pixel. The
-    amplitude of a plane is proportional to its scale to the power `slope`. coarsest: largest scale, in field edges.
+    The noise is a sum of smooth random planes. Each plane has half the scale of the previous one, down to one pixel.
+    The amplitude of a plane is proportional to its scale to the power `slope`. coarsest: largest scale, in field edges.
     """
     shape, edge = canvas.shape, canvas.edge
     total = np.zeros(shape)
@@ -207,7 +209,9 @@ def _texture(canvas: _Canvas, rng: np.random.Generator) -> Plane:
 
 
 def _large_scale(x: Plane, y: Plane) -> Plane:
-    """A factor on the quiet Sun: a coronal hole (about a tenth) at the top right, and a bright belt at the active regions."""
+    """A factor on the quiet Sun: a coronal hole (about a tenth) at the top right, and a bright belt at the active
+    regions.
+    """
     hole = np.exp(-((((x - 0.80) / 0.19) ** 2 + ((y - 0.80 + 0.3 * (x - 0.8)) / 0.17) ** 2) ** 2))
     belt = 1 + 0.9 * np.exp(-(((y - 0.27) / 0.20) ** 2))
     return (1 - 0.88 * hole) * belt
@@ -267,7 +271,7 @@ def _draw_bundle(region: _Region, rng: np.random.Generator) -> _Bundle:
 
 
 def _strand(bundle: _Bundle, edge: int, rng: np.random.Generator) -> tuple[Plane, Plane, Plane]:
-    """x and y (field edges) and brightness of points along one strand, about three points per pixel."""
+    """X and y (field edges) and brightness of points along one strand, about three points per pixel."""
     span = bundle.span * rng.normal(1, 0.05)
     rise = bundle.rise * rng.normal(1, 0.13)
     t = np.linspace(0, np.pi, max(16, int(3 * (2 * span + 2 * rise) * edge)))

@@ -2,8 +2,8 @@
 
     I_i = P (S_f - h_i)        Eq. (1)
 
-P is the convolution with the total PSF, which is cut to the reach of 2048 x 2048 px. Because P is linear, the scene of a
-pointing is convolved once for all its images; only the hidden light is convolved for each image.
+P is the convolution with the total PSF, which is cut to the reach of 2048 x 2048 px. Because P is linear, the scene of
+a pointing is convolved once for all its images; only the hidden light is convolved for each image.
 
 | symbol | name | unit |
 |---|---|---|
@@ -51,9 +51,9 @@ class TrueSky:
     """Scenes, occulter and PSF of a transit; all planes float64 [y, x] in DN/s on detector pixels.
 
     diffraction, kernel: weights [y, x], centre at [n // 2, n // 2]. kernel is the total PSF on twice the edge of the
-    scenes, at most the full reach. scenes: the scene of each pointing, plan.margin_px larger than the field on each side.
-    seen_scenes: the scene of each pointing without the occulter, convolved with the PSF, on the field. behind: for each
-    image, the patch of the scene around the occulter.
+    scenes, at most the full reach. scenes: the scene of each pointing, plan.margin_px larger than the field on each
+    side. seen_scenes: the scene of each pointing without the occulter, convolved with the PSF, on the field. behind:
+    for each image, the patch of the scene around the occulter.
     """
 
     plan: Plan
@@ -203,8 +203,8 @@ def fully_dark(place: Place, first: tuple[int, int], shape: tuple[int, int]) -> 
 class Behind:
     """A patch of the scene around one position of the disc: fine pixels [y, x] in DN/s.
 
-    first: (row, column) in the field of the first detector pixel of the patch. fine: number of fine pixels in a detector
-    pixel along each axis.
+    first: (row, column) in the field of the first detector pixel of the patch. fine: number of fine pixels in a
+    detector pixel along each axis.
     """
 
     first: tuple[int, int]

@@ -1,9 +1,10 @@
-"""A simulated transit: scenes convolved with a known PSF, with photon noise and read noise, in whole DN; and its folder.
+"""A simulated transit: scenes convolved with a known PSF, with photon noise and read noise, in whole DN; and its
+folder.
 
     D_i = round(min(g Poisson(I_i t / g) + read + dark, saturation)),  frame i = D_i / t     Eq. (1)
 
-The plan (plan.py) gives the positions and exposures, and the sky (sky.py) gives the noise-free images. If whole_dn of the
-plan is False, D_i is not rounded. Only high-only images saturate.
+The plan (plan.py) gives the positions and exposures, and the sky (sky.py) gives the noise-free images. If whole_dn of
+the plan is False, D_i is not rounded. Only high-only images saturate.
 
 | symbol | name | unit |
 |---|---|---|
@@ -173,10 +174,10 @@ def simulate(
 ) -> SimulatedTransit:
     """A transit of `plan`. Its PSF is `scatter` convolved with `diffraction`. Equal arguments give equal results.
 
-    diffraction: weights [y, x], centre at [n // 2, n // 2], sum 1. seed: random seed of the scenes, the ephemeris errors
-    and the noise. scenes: for each pointing, a scene to use instead of a synthetic scene, as drawn_scene and
-    scene_from_image of psfcore.simulate.scene return it.
-    imitated: the instrument whose keywords the headers get. Raises DataError "bad-diffraction", "bad-scene".
+    diffraction: weights [y, x], centre at [n // 2, n // 2], sum 1. seed: random seed of the scenes, the ephemeris
+    errors and the noise. scenes: for each pointing, a scene to use instead of a synthetic scene, as drawn_scene and
+    scene_from_image of psfcore.simulate.scene return it. imitated: the instrument whose keywords the headers get.
+    Raises DataError "bad-diffraction", "bad-scene".
     """
     sky = true_sky(plan, scatter, diffraction, seed, scenes=scenes, threads=threads)
     return observed_transit(sky, seed, imitated)
@@ -223,7 +224,9 @@ def _read_out(plan: Plan, index: int, expected: Plane, seed: int) -> Plane:
 
 
 def reported_places(plan: Plan, seed: int) -> list[Place]:
-    """The positions of the occulter that a transit states: the exact positions plus errors of the ephemeris, rounded to a tenth of a pixel."""
+    """The positions of the occulter that a transit states: the exact positions plus errors of the ephemeris, rounded to
+    a tenth of a pixel.
+    """
     rng = np.random.default_rng([seed, _EPHEMERIS])
     errors = rng.normal(0.0, plan.ephemeris_error_px, (len(plan.shots), 2))
     return [
@@ -290,7 +293,8 @@ def write_observation(
         write_plane(folder / file, dn, cards=_commented(values))
         at = {"x": place.x_px, "y": place.y_px, "r": place.radius_px}
         entries.append({"file": file, "fov": shot.pointing, **at})
-    # PSFSUM says that the file is a PSF, see `content_of`; otherwise it would be deconvolved like an image of the folder.
+    # PSFSUM says that the file is a PSF, see `content_of`; otherwise it would be deconvolved like an image of the
+    # folder.
     is_psf: dict[str, CardValue] = {"PSFSUM": float(diffraction.sum())}
     write_plane(folder / DIFFRACTION_FILE, diffraction, cards=_commented(imitated.values() | is_psf))
     content = {

@@ -92,7 +92,8 @@ def profile(tables: Tables) -> dict[str, Any]:
     return {
         **_about(tables),
         **tables["profile"],
-        "resolution": "rings are one pixel wide: a pixel belongs to the ring whose radius_px is its distance r, rounded to whole pixels",
+        "resolution": "rings are one pixel wide: a pixel belongs to the ring whose radius_px is its distance r, "
+        "rounded to whole pixels",
     }
 
 
@@ -155,7 +156,8 @@ def compare(one: Tables, other: Tables) -> dict[str, Any]:
     ):
         raise DataError(
             "plate-scale-mismatch",
-            f"expected two PSFs of the same plate scale; got {old_scale:g} and {new_scale:g} arcsec/px: rebin one of them first",
+            f"expected two PSFs of the same plate scale; got {old_scale:g} and {new_scale:g} arcsec/px: rebin one of "
+            "them first",
         )
     reach = min(one["reach_px"], other["reach_px"])
     shared = set(other["radii_px"])
@@ -191,7 +193,8 @@ def compare(one: Tables, other: Tables) -> dict[str, Any]:
         "difference_of_central_weights": other["central_weight"] - one["central_weight"],
         "only_in_one": sorted(set(one["encircled"]) - set(names)),
         "only_in_other": sorted(set(other["encircled"]) - set(names)),
-        "resolution": "at radii that both tables have, without interpolation; the errors assume that the two PSFs were fitted to independent data",
+        "resolution": "at radii that both tables have, without interpolation; the errors assume that the two PSFs "
+        "were fitted to independent data",
     }
 
 
@@ -210,13 +213,15 @@ def _about(tables: Tables) -> dict[str, Any]:
 
 def _resolution(tables: Tables) -> str:
     """A sentence that says at which radii the answer is exact, and how large the interpolation error is at other
-    radii."""
+    radii.
+    """
     worst = 100 * max(tables["interpolation_error"].values())
     near = f"exact to {min(tables['exact_to_px'], tables['reach_px']):g} px and at whole pixels up to {WHOLE_TO_PX} px"
     if worst < NEGLIGIBLE_POINTS:
         return f"{near}; elsewhere interpolated linearly, with an error below {NEGLIGIBLE_POINTS} points"
     return (
-        f"{near}; elsewhere interpolated linearly (steps of 1 px up to {WHOLE_TO_PX} px, 2 % farther out), with an error "
+        f"{near}; elsewhere interpolated linearly (steps of 1 px up to {WHOLE_TO_PX} px, 2 % farther out), with an "
+        "error "
         f"of up to {worst:.2f} points ({100 * tables['interpolation_error'][TOTAL]:.2f} for the total PSF)"
     )
 
@@ -257,7 +262,9 @@ def _read(exact_to_px: float, grid: Numbers, row: Numbers, at: int, radius: floa
 
 
 def _sigma(tables: Tables, of: Callable[[Numbers], Numbers]) -> dict[str, Numbers]:
-    """The 1-sigma errors of numbers that `of` computes linearly from E, by component; empty if the PSF was not fitted."""
+    """The 1-sigma errors of numbers that `of` computes linearly from E, by component; empty if the PSF was not
+    fitted.
+    """
     return {
         name: [math.hypot(*column) for column in zip(*(of(row) for row in rows), strict=True)]
         for name, rows in tables["encircled_changes"].items()

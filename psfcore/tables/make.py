@@ -6,7 +6,8 @@
 - up to WHOLE_TO_PX: every whole number of pixels;
 - farther out: steps of 2 %, and the reach itself.
 
-Beyond EXACT_TO_PX, E is interpolated linearly between the radii. The tables state the largest error found at test radii.
+Beyond EXACT_TO_PX, E is interpolated linearly between the radii. The tables state the largest error found at test
+radii.
 
 If the PSF was fitted, the tables also hold the changes of E for a step of 1 sigma along each axis of the covariance of
 the fit. These changes are computed to first order, as in the report of the fit.
@@ -97,7 +98,8 @@ def _test_radii(radii: Vector) -> Vector:
 
 
 def _changes(psf: Psf, radii: Vector, threads: int) -> dict[str, tuple[list[Vector], list[Vector]]]:
-    """The changes of E at the radii, and of the mean weight of each ring, for 1 sigma along each axis of the covariance.
+    """The changes of E at the radii, and of the mean weight of each ring, for 1 sigma along each axis of the
+    covariance.
 
     The keys are the total PSF and its scatter; the dictionary is empty if the PSF was not fitted.
     """
@@ -120,7 +122,8 @@ def _changes(psf: Psf, radii: Vector, threads: int) -> dict[str, tuple[list[Vect
 
 def _read_off(changes: list[Kernel], radii: Vector) -> tuple[list[Vector], list[Vector]]:
     """Two lists with one entry for each change of the kernel: the change of E at the radii; the change of the mean
-    weight of each ring."""
+    weight of each ring.
+    """
     within = [encircled_energy(change, radii) for change in changes]
     return within, [radial_profile(change)[1] for change in changes]
 

@@ -1,6 +1,7 @@
 """The rules for accepting the members of an archive: their names, their number, their sizes.
 
-The rules are the same for a .zip and a .tar. This module imports no other library: a process that reads an archive is short.
+The rules are the same for a .zip and a .tar. This module imports no other library: a process that reads an archive is
+short.
 """
 
 from __future__ import annotations
@@ -87,7 +88,8 @@ class Gate:
         self._declared_bytes += size
         if self._declared_bytes > self.limits.max_bytes:
             message = (
-                f"expected an archive that unpacks to at most {self.limits.max_bytes} bytes; got more: pack fewer or smaller "
+                f"expected an archive that unpacks to at most {self.limits.max_bytes} bytes; got more: pack fewer or "
+                "smaller "
                 "images"
             )
             raise DataError("archive-too-large", message)
@@ -124,7 +126,9 @@ class Gate:
         return "/" in file.folder or (file.folder != "" and self._is_at_top)
 
     def check_folder(self, raw_name: str) -> None:
-        """Check the entry of a folder; the folder is not created. Raises DataError "archive-climbs", "archive-not-plain"."""
+        """Check the entry of a folder; the folder is not created. Raises DataError "archive-climbs",
+        "archive-not-plain".
+        """
         parts = _parts(raw_name)
         if _is_hidden(parts):
             return
@@ -174,7 +178,10 @@ def _parts(raw_name: str) -> list[str]:
     parts = [part for part in raw_name.split("/") if part not in ("", ".")]
     climbs = raw_name.startswith("/") or "\\" in raw_name or ".." in parts
     if climbs or any(_DRIVE.match(part) for part in parts):
-        message = f"expected names inside the folder of the archive; got {shown(raw_name)}: pack the files without their paths"
+        message = (
+            f"expected names inside the folder of the archive; got {shown(raw_name)}: pack the files without "
+            "their paths"
+        )
         raise DataError("archive-climbs", message)
     return parts
 

@@ -1,8 +1,9 @@
 """A transit in one archive file (.zip, .tar or .tar.gz), or in a folder: list, unpack, pack and identify it.
 
 The first bytes of the file identify the kind of archive. The members must be plain files with plain names, at the top
-level or in one folder. A limited process reads them (`members`), and `admission` decides which of them are accepted. This
-process handles the names and plain bytes that come back. If an archive is refused, none of its files is left on disk.
+level or in one folder. A limited process reads them (`members`), and `admission` decides which of them are accepted.
+This process handles the names and plain bytes that come back. If an archive is refused, none of its files is left on
+disk.
 
 This module imports no numerical library, so that the web process can list an upload.
 """
@@ -42,8 +43,9 @@ BYTES_A_PIXEL = 4  # of a file whose start does not tell its shape
 
 @dataclass(frozen=True)
 class ArchiveContents:
-    """The contents of an archive: its kind, its manifest, the name and the declared bytes of each file, and the number of
-    pixels of all images that the manifest names."""
+    """The contents of an archive: its kind, its manifest, the name and the declared bytes of each file, and the number
+    of pixels of all images that the manifest names.
+    """
 
     kind: Kind
     manifest: TransitManifest
@@ -53,7 +55,9 @@ class ArchiveContents:
 
 @dataclass(frozen=True)
 class FolderTransit:
-    """A folder with a transit that is not packed. sha256, bytes: hash and size of the .tar file that ``pack`` would write."""
+    """A folder with a transit that is not packed. sha256, bytes: hash and size of the .tar file that ``pack`` would
+    write.
+    """
 
     folder: Path
     sha256: str
@@ -127,7 +131,8 @@ def _files_in(
 ) -> Iterator[tuple[Kind, list[Copied], BinaryIO]]:
     """The kind of an archive, its files in their order, and the file with their plain bytes.
 
-    scratch: the folder of a temporary file. start_bytes: the number of bytes that are needed of each file (``copy_files``).
+    scratch: the folder of a temporary file. start_bytes: the number of bytes that are needed of each file
+    (``copy_files``).
     """
     with path.open("rb") as archive, TemporaryFile(dir=scratch) as temporary:
         content = cast(BinaryIO, temporary)
@@ -148,7 +153,10 @@ def _files_in(
         except DataError as error:
             if error.code != "unreadable-pixels":
                 raise
-            message = "expected an archive that is read in the memory and time that its size explains; got one that needs more"
+            message = (
+                "expected an archive that is read in the memory and time that its size explains; got one that "
+                "needs more"
+            )
             raise DataError(
                 "archive-broken", f"{message}: pack the files again, for example as .zip"
             ) from None

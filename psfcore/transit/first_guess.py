@@ -6,8 +6,8 @@ homogeneous, all light in the centre of a small dark disc comes from farther tha
     I_o,dc = I_t sum over dr > r_disk of psf(dr),  mean I_o = I_t
     sum over dr > r_disk of psf(dr) = I_o,dc / mean I_o                     Eq. (1)
 
-There are three estimators of the characteristic intensity, mean I_o: the mean of the image, the median of the image, and
-the mean in a ring ("shell") of 50 px around the disc.
+There are three estimators of the characteristic intensity, mean I_o: the mean of the image, the median of the image,
+and the mean in a ring ("shell") of 50 px around the disc.
 
 | symbol | name | unit |
 |---|---|---|
@@ -37,7 +37,8 @@ from psfcore.transit.transit import Frame, Place, Transit
 
 CENTRE_PX = 2.0
 SHELL_PX = 50.0
-# Departure from the paper: the shell begins 2 px outside the disc, beyond its blurred edge and ephemeris errors of 1 px.
+# Departure from the paper: the shell begins 2 px outside the disc, beyond its blurred edge and ephemeris errors of 1
+# px.
 EDGE_PX = 2.0
 ESTIMATORS = ("image_mean", "image_median", "shell")
 
@@ -48,8 +49,8 @@ Flat = NDArray[np.float64]
 class FrameGuess:
     """The first guess from one image. Intensities are in DN/s; a value that cannot be computed is NaN.
 
-    characteristic_dn_s and ratio have one value for each estimator. inhomogeneity: infinite if the centre of the disc is
-    not in the image, or if one of the estimators is not above 0.
+    characteristic_dn_s and ratio have one value for each estimator. inhomogeneity: infinite if the centre of the disc
+    is not in the image, or if one of the estimators is not above 0.
     """
 
     file: str
@@ -70,7 +71,8 @@ class FrameGuess:
 
 @dataclass(frozen=True)
 class PointingGuess:
-    """The first guess from one pointing: mean and standard deviation (scatter) of the ratio over its images, by estimator.
+    """The first guess from one pointing: mean and standard deviation (scatter) of the ratio over its images, by
+    estimator.
 
     inhomogeneity: the median over the images of the pointing.
     """
@@ -100,7 +102,8 @@ class FirstGuess:
 
     def to_json(self) -> dict[str, Any]:
         """The first guess as JSON values; NaN and infinity become null. The keys "best_fov" and "fov" contain
-        the number of a pointing."""
+        the number of a pointing.
+        """
         return {
             "best_fov": self.best_pointing,
             **json_attributes(self, "share", "share_spread", "radius_px"),
@@ -134,7 +137,8 @@ def first_guess(transit: Transit) -> FirstGuess:
     telling = [p for p in pointings if math.isfinite(p.inhomogeneity)]
     if not telling:
         message = (
-            "expected at least one image that shows the centre of the occulter in front of the Sun; got none: check the "
+            "expected at least one image that shows the centre of the occulter in front of the Sun; got none: check "
+            "the "
             "positions in transit.json"
         )
         raise DataError("no-first-guess", message)
@@ -207,7 +211,9 @@ def _pointing_guess(pointing: int, guesses: Sequence[FrameGuess]) -> PointingGue
 
 
 def _range_over_mean(values: list[float]) -> float:
-    """The range (largest minus smallest) of the finite values divided by their mean; infinite if the mean is not above 0."""
+    """The range (largest minus smallest) of the finite values divided by their mean; infinite if the mean is not above
+    0.
+    """
     finite = _finite(values)
     if finite.size == 0 or finite.mean() <= 0:
         return math.inf

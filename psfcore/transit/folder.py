@@ -1,7 +1,7 @@
 """Read a transit from its folder: transit.json, its images one after the other, and the known part of the PSF.
 
-All headers are read first, so that a missing file or a wrong shape is reported at once. Reading the pixels takes minutes.
-Pixels are kept as float32: 126 images of 2048 px take 2.1 GiB.
+All headers are read first, so that a missing file or a wrong shape is reported at once. Reading the pixels takes
+minutes. Pixels are kept as float32: 126 images of 2048 px take 2.1 GiB.
 """
 
 from __future__ import annotations
@@ -52,7 +52,8 @@ def read_prepared(
     noise: Noise | None = None,
     saturation_dn: float | None = None,
 ) -> tuple[Transit, Prepared]:
-    """Read the transit in a folder, in DN/s, with frames in time order; also return the counts of saturated and filled pixels.
+    """Read the transit in a folder, in DN/s, with frames in time order; also return the counts of saturated and filled
+    pixels.
 
     progress(done, of) is called after each image. diffraction: weights [y, x], or a function of (name of the instrument
     or None, shape of the images) that returns them; used if transit.json has no known_psf. noise: replaces the noise
@@ -61,9 +62,9 @@ def read_prepared(
     DATE-OBS. If one image has neither, all images keep the order of transit.json, with one second between them.
 
     Raises DataError: "transit-shapes", "occulter-outside", "occulter-too-large", "no-noise-figures", "no-known-psf",
-    "known-psf-..." (see ``checked_kernel``), the errors of ``checked_folder``, the errors of ``read_observation`` with the
-    name of the file, and the errors of ``prepare``. Raises HeaderError for faults of a header. If several images have
-    faults, one error names all of them.
+    "known-psf-..." (see ``checked_kernel``), the errors of ``checked_folder``, the errors of ``read_observation`` with
+    the name of the file, and the errors of ``prepare``. Raises HeaderError for faults of a header. If several images
+    have faults, one error names all of them.
     """
     folder = Path(folder)
     manifest = checked_folder(folder).manifest
@@ -160,7 +161,9 @@ def _check_frame(n: int, images: Sequence[ImageEntry], headers: Sequence[HeaderS
 
 
 def times_s(headers: Sequence[HeaderSummary]) -> list[float]:
-    """Start of each image in seconds after the first image; if one image has no readable date, the index of each image."""
+    """Start of each image in seconds after the first image; if one image has no readable date, the index of each
+    image.
+    """
     starts = [None if header.date_obs is None else instant(header.date_obs) for header in headers]
     dates = [start for start in starts if start is not None]
     if len(dates) < len(starts):
@@ -205,8 +208,8 @@ def _known_psf(
 def checked_kernel(kernel: Kernel, label: str) -> Kernel:
     """Check the known part of a PSF [y, x], centre at [ny // 2, nx // 2], and normalise it to sum 1.
 
-    A sum that differs from 1 by at most KNOWN_PSF_SUM_TOLERANCE counts as rounding. label: the name of the PSF in errors.
-    Raises DataError "known-psf-small", "known-psf-nonfinite", "known-psf-negative", "known-psf-sum",
+    A sum that differs from 1 by at most KNOWN_PSF_SUM_TOLERANCE counts as rounding. label: the name of the PSF in
+    errors. Raises DataError "known-psf-small", "known-psf-nonfinite", "known-psf-negative", "known-psf-sum",
     "known-psf-not-centred".
     """
     if kernel.ndim != 2 or min(kernel.shape) < SMALLEST_KNOWN_PSF_PX:

@@ -1,7 +1,7 @@
 """Copy the files of a .zip, .tar or .tar.gz into one file, in a process of its own (`psfcore.limited`).
 
-No field of an archive can be trusted: an attacker may have written it. ``zipfile`` and ``tarfile`` limit neither the memory nor
-the time that they use; the process limits both. `admission` decides which members are accepted.
+No field of an archive can be trusted: an attacker may have written it. ``zipfile`` and ``tarfile`` limit neither the
+memory nor the time that they use; the process limits both. `admission` decides which members are accepted.
 """
 
 from __future__ import annotations
@@ -70,8 +70,10 @@ def archive_kind(start: bytes) -> Literal["zip", "tar", "gzip"] | None:
 
 
 class Copied(NamedTuple):
-    """A file of an archive, and where its bytes are: ``length`` bytes from position ``at`` of the target of ``copy_files``, or of
-    the archive itself if whole files of a .tar were asked for, which holds plain bytes. size_bytes: the declared size."""
+    """A file of an archive, and where its bytes are: ``length`` bytes from position ``at`` of the target of
+    ``copy_files``, or of the archive itself if whole files of a .tar were asked for, which holds plain bytes.
+    size_bytes: the declared size.
+    """
 
     name: str
     size_bytes: int
@@ -83,8 +85,8 @@ class Copied(NamedTuple):
 class _Entry:
     """A member of an archive.
 
-    fault: why it is not a plain file; empty if it is one. at: the position of its plain bytes in a .tar; None in other archives,
-    where ``open`` gives them.
+    fault: why it is not a plain file; empty if it is one. at: the position of its plain bytes in a .tar; None in other
+    archives, where ``open`` gives them.
     """
 
     name: str
@@ -158,7 +160,9 @@ def plain_start(file: IO[bytes], count: int) -> bytes:
 
 
 def copy_bytes(source: IO[bytes], target: IO[bytes], count: int, name: str) -> None:
-    """Copy the next bytes of an open file. name: for the error. Raises DataError "archive-broken" if there are fewer."""
+    """Copy the next bytes of an open file. name: for the error. Raises DataError "archive-broken" if there are
+    fewer.
+    """
     while count and (piece := source.read(min(count, _PIECE_BYTES))):
         target.write(piece)
         count -= len(piece)
@@ -192,7 +196,10 @@ def _kind(path: str) -> Kind:
                 return "tar.gz"
     elif kind is not None:
         return kind
-    message = f"expected a .zip, .tar or .tar.gz; got {'a gzip file that contains no tar' if kind else 'another format'}"
+    message = (
+        "expected a .zip, .tar or .tar.gz; got "
+        f"{'a gzip file that contains no tar' if kind else 'another format'}"
+    )
     raise DataError("not-an-archive", message)
 
 

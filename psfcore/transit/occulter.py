@@ -57,7 +57,8 @@ DOUBT_SIGMAS = 3.0
 UNDESCRIBED = 4.0  # if chi2 per pixel is larger, the simulation does not describe the patch
 DAMPED_FROM = 6  # from this step on each step is halved: steps may oscillate where the scene is faint
 DECONVOLUTION_NOISE = 2.3  # factor by which a deconvolution increases noise, for a core weight of 0.43
-# Least intensity, DN/s: a patch without light has no photon noise, and a noise that was measured can have no read noise.
+# Least intensity, DN/s: a patch without light has no photon noise, and a noise that was measured can have no read
+# noise.
 LEAST_LEVEL = 1e-6
 _STRIPS = 32
 _DIFFERENCE_PX = 0.05
@@ -101,7 +102,8 @@ def coverage(shape: tuple[int, int], place: Place) -> Plane:
     strip = (np.arange(rows.start * _STRIPS, rows.stop * _STRIPS) + 0.5) / _STRIPS - 0.5
     half = np.sqrt(np.maximum(place.radius_px**2 - (strip - place.y_px) ** 2, 0.0))
     edges = np.arange(columns.start, columns.stop + 1) - 0.5 - place.x_px
-    # The part of each chord that is left of an edge, from the middle of the chord; a pixel covers the part between its edges.
+    # The part of each chord that is left of an edge, from the middle of the chord; a pixel covers the part between its
+    # edges.
     until = np.clip(edges, -half[:, None], half[:, None])
     out = np.zeros(shape)
     out[rows, columns] = np.diff(until.reshape(-1, _STRIPS, edges.size).mean(axis=1), axis=1)
@@ -135,8 +137,8 @@ def patch_window(shape: tuple[int, int], place: Place, margin_px: float = PATCH_
 def neighbours_of(index: int, frames: Sequence[Frame], places: Sequence[Place], noise: Noise) -> list[int]:
     """The frames of the same pointing, nearest in time, whose occulters do not overlap the patch of this one.
 
-    At least LEAST_NEIGHBOURS such frames are chosen, if the transit has enough. More are chosen until all of them together
-    have ENOUGH_PHOTONS photons per pixel.
+    At least LEAST_NEIGHBOURS such frames are chosen, if the transit has enough. More are chosen until all of them
+    together have ENOUGH_PHOTONS photons per pixel.
     """
     here, frame = places[index], frames[index]
     reach = here.radius_px + PATCH_MARGIN_PX
@@ -155,8 +157,8 @@ def neighbours_of(index: int, frames: Sequence[Frame], places: Sequence[Place], 
         if len(chosen) >= LEAST_NEIGHBOURS and photons >= ENOUGH_PHOTONS:
             break
         level = float(frames[k].pixels[window].mean(dtype=np.float64))
-        # The square of signal / noise: the number of photons, reduced because of the read noise. An image without light has
-        # no photons; its mean can be negative if an effect that is too strong was subtracted.
+        # The square of signal / noise: the number of photons, reduced because of the read noise. An image without light
+        # has no photons; its mean can be negative if an effect that is too strong was subtracted.
         if level > 0:
             photons += level**2 / float(noise.variance(np.array(level), frames[k].exposure_s))
         chosen.append(k)
@@ -173,8 +175,8 @@ def find_occulter(
 ) -> FoundPlace:
     """Find the position of the occulter in frame `index`.
 
-    scene_of: the deconvolved frame [y, x] of an index, DN/s. places: the best known positions of the occulter in all frames; they decide
-    which frames are neighbours. psf_kernel: weights [y, x], centre at [n // 2, n // 2].
+    scene_of: the deconvolved frame [y, x] of an index, DN/s. places: the best known positions of the occulter in all
+    frames; they decide which frames are neighbours. psf_kernel: weights [y, x], centre at [n // 2, n // 2].
     """
     frame, start = frames[index], frames[index].place
     window = patch_window(frame.pixels.shape, start)
@@ -242,7 +244,8 @@ def _solve(
     """
     at = np.array([start.x_px, start.y_px, 1.0, 0.0])
     origin, radius = at.copy(), start.radius_px
-    # Noise of the neighbours would bias a free scale towards 0, and the rest of the scene's gradient would shift the disc.
+    # Noise of the neighbours would bias a free scale towards 0, and the rest of the scene's gradient would shift the
+    # disc.
     prior = np.diag([EPHEMERIS_SIGMA_PX**-2, EPHEMERIS_SIGMA_PX**-2, SCALE_SIGMA**-2, 0.0])
     h = _DIFFERENCE_PX
     settled, done = False, 0

@@ -130,9 +130,9 @@ def prepare(exposures: Sequence[Exposure]) -> tuple[tuple[Frame, ...], Prepared]
     """Return frames without gaps, in the given order, and the counts of each frame.
 
     A pixel in a gap gets its value from another frame of the same pointing: from the frame nearest in time that has no
-    gap at this pixel. If there is no such frame, a finite (saturated) pixel keeps its value. Any other pixel then gets the
-    median of its neighbours. The pixel arrays of the exposures are changed in place; the frames use the same arrays.
-    Raises DataError "all-saturated" if more than half of the pixels of a frame stay saturated.
+    gap at this pixel. If there is no such frame, a finite (saturated) pixel keeps its value. Any other pixel then gets
+    the median of its neighbours. The pixel arrays of the exposures are changed in place; the frames use the same
+    arrays. Raises DataError "all-saturated" if more than half of the pixels of a frame stay saturated.
     """
     counts = [_fill(exposure, exposures) for exposure in exposures]
     frames = tuple(
@@ -167,7 +167,8 @@ def _fill(exposure: Exposure, exposures: Sequence[Exposure]) -> FrameCounts:
         share = 100 * unfilled / kept.size
         raise DataError(
             "all-saturated",
-            f"{exposure.file}: {message}; got {share:.0f} % saturated pixels that cannot be filled: leave this image out",
+            f"{exposure.file}: {message}; got {share:.0f} % saturated pixels that cannot be filled: leave this image "
+            "out",
         )
     _fill_from_neighbours(exposure.pixels, left & ~kept, exposure.gaps)
     return FrameCounts(

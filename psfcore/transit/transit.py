@@ -1,9 +1,9 @@
 """A transit, ready for analysis: images of a dark disc in front of the Sun, all in DN/s; folds of a cross-validation.
 
-Folds are sequential blocks of held-out images, with a guard on both sides. Hofmeister et al., The point-spread function of
-HRI_EUV, section "Accuracy and robustness": 126 images are divided into ten sequential blocks. Three images on each side of
-a block are not used. Here N images give min(10, N // 3) blocks and a guard of round(3 N / 126) images on each side; if
-N >= 12, the guard has at least one image.
+Folds are sequential blocks of held-out images, with a guard on both sides. Hofmeister et al., The point-spread function
+of HRI_EUV, section "Accuracy and robustness": 126 images are divided into ten sequential blocks. Three images on each
+side of a block are not used. Here N images give min(10, N // 3) blocks and a guard of round(3 N / 126) images on each
+side; if N >= 12, the guard has at least one image.
 
 | symbol | name | unit |
 |---|---|---|
@@ -52,7 +52,8 @@ def check_reaches_in(place: Place, shape: tuple[int, ...], label: str) -> None:
         got = f"x = {place.x_px:g}, y = {place.y_px:g}, r = {place.radius_px:g}"
         raise DataError(
             "occulter-outside",
-            f"{label}: expected an occulter at least partly inside the image of {nx} x {ny} px; got {got}: correct the position",
+            f"{label}: expected an occulter at least partly inside the image of {nx} x {ny} px; got {got}: correct "
+            "the position",
         )
 
 
@@ -60,10 +61,10 @@ def check_reaches_in(place: Place, shape: tuple[int, ...], label: str) -> None:
 class Frame:
     """One image of a transit: pixels [y, x] in DN/s (float32, finite), and the occulter's position from the ephemeris.
 
-    time_s: seconds since the start of the first frame. filled: True for pixels [y, x] without a valid value of their own.
-    Their values come from another frame or from neighbouring pixels, or they are saturated. An analysis of the occulter
-    must not use these pixels.
-    Raises DataError "frame-shape", "frame-nonfinite", "frame-exposure", "occulter-outside".
+    time_s: seconds since the start of the first frame. filled: True for pixels [y, x] without a valid value of their
+    own. Their values come from another frame or from neighbouring pixels, or they are saturated. An analysis of the
+    occulter must not use these pixels. Raises DataError "frame-shape", "frame-nonfinite", "frame-exposure",
+    "occulter-outside".
     """
 
     file: str
@@ -84,7 +85,8 @@ class Frame:
         if self.filled is not None and self.filled.shape != self.pixels.shape:
             raise DataError(
                 "frame-shape",
-                f"{self.file}: expected a plane `filled` of the shape {self.pixels.shape} of the pixels; got {self.filled.shape}",
+                f"{self.file}: expected a plane `filled` of the shape {self.pixels.shape} of the pixels; got "
+                f"{self.filled.shape}",
             )
         if not np.isfinite(self.pixels).all():
             raise DataError(
@@ -133,7 +135,9 @@ class Transit:
 
 @dataclass(frozen=True)
 class Fold:
-    """The held-out images of a block, and the images to fit: all other images except the guard. Indices in time order."""
+    """The held-out images of a block, and the images to fit: all other images except the guard. Indices in time
+    order.
+    """
 
     held_out: tuple[int, ...]
     fitted: tuple[int, ...]

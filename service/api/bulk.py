@@ -1,4 +1,6 @@
-"""Bulk runs, many images deconvolved in the same way: ``/v1/bulk``; and their results, image by image, as JSON lines or as CSV."""
+"""Bulk runs, many images deconvolved in the same way: ``/v1/bulk``; and their results, image by image, as JSON lines or
+as CSV.
+"""
 
 from __future__ import annotations
 
@@ -183,7 +185,8 @@ class Result(RowView):
     ended_at: float
     seconds: float | None = Field(description="time that the worker spent on the image; null: unknown")
     kernel_seconds: float | None = Field(
-        description="part of `seconds` that was spent on deconvolving and on measuring changes; null: the product already existed"
+        description="part of `seconds` that was spent on deconvolving and on measuring changes; null: the product "
+        "already existed"
     )
 
     @classmethod
@@ -248,7 +251,8 @@ def submit_bulk(body: BulkRequest, response: Response, caller: Bulk, state: Shar
     """Deconvolve many images in the same way. Workers list the files, and deconvolve images as soon as they are listed.
     All other jobs run first.
 
-    The PSF, or the context that pins a PSF for each image, is fixed when the run starts. An existing product is not made again.
+    The PSF, or the context that pins a PSF for each image, is fixed when the run starts. An existing product is not
+    made again.
     """
     if body.keeps_products:
         check_room(state, caller.owner)
@@ -318,7 +322,8 @@ def cancel_bulk(bulk_id: BulkId, caller: Bulk, state: Shared) -> BulkView:
 def retry_bulk(bulk_id: BulkId, caller: Bulk, state: Shared) -> BulkView:
     """Queue the failed images again. Images that are already done are not processed again.
 
-    The answer is 409 if this run has ended and another bulk run of an identical request is open. The message names that run.
+    The answer is 409 if this run has ended and another bulk run of an identical request is open. The message names that
+    run.
     """
     row = find(state, caller, bulk_id)
     with as_problems():

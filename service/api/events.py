@@ -1,15 +1,17 @@
 """Progress as server-sent events: of one job or bulk run, ``/v1/jobs/{id}/events`` and ``/v1/bulk/{id}/events``, and of
 all jobs and bulk runs of an owner, ``/v1/events``.
 
-The streams of an owner read the database together every ``LOOK_EVERY_S`` seconds (``service.http.lookout``), so any server
-can send them. They ask what changed since the last look; the number of queries does not depend on the number of jobs.
+The streams of an owner read the database together every ``LOOK_EVERY_S`` seconds (``service.http.lookout``), so any
+server can send them. They ask what changed since the last look; the number of queries does not depend on the number of
+jobs.
 
-In the stream of one job or bulk run, the id of an event is the version of its row. If a client reconnects with the id of its
-last event (``Last-Event-ID``), it gets an event at once only if the row has changed in the meantime.
+In the stream of one job or bulk run, the id of an event is the version of its row. If a client reconnects with the id
+of its last event (``Last-Event-ID``), it gets an event at once only if the row has changed in the meantime.
 
 Browsers open at most six connections to a server over HTTP/1.1. A page with one stream for each job would use all six.
-Therefore one stream sends all jobs and bulk runs of an owner. The id of an event is a time (database clock): a client that
-reconnects with this id gets what changed after this time. Deletions are found among the rows that the stream has sent.
+Therefore one stream sends all jobs and bulk runs of an owner. The id of an event is a time (database clock): a client
+that reconnects with this id gets what changed after this time. Deletions are found among the rows that the stream has
+sent.
 """
 
 from __future__ import annotations
@@ -47,14 +49,16 @@ Id = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{32}$")]
 Moment = Annotated[str | None, Header(alias="Last-Event-ID", pattern=r"^[0-9]{1,12}\.[0-9]{3}$")]
 STREAM: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "Events `progress`. The data of each event is the complete job or bulk run. The last event is `end`.",
+        "description": "Events `progress`. The data of each event is the complete job or bulk run. The last event is "
+        "`end`.",
         "content": {TYPE: {}},
     },
     204: {"description": "The last event that the client received was `end`; no more events follow."},
 }
 STREAM_OF_OWNER: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "Events `job` and `bulk` are sent for new and changed jobs and bulk runs; the data is the complete job "
+        "description": "Events `job` and `bulk` are sent for new and changed jobs and bulk runs; the data is the "
+        "complete job "
         'or bulk run. Events `gone` are sent for deleted ones; the data is {"kind": "job" or "bulk", "id": ...}. '
         "A bulk run that ended before the stream began is followed only if the request names it.",
         "content": {TYPE: {}},

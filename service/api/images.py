@@ -1,5 +1,6 @@
-"""Uploaded images, ``/v1/images``, and the products of their deconvolutions, ``/v1/products``; and for PSFs and products their lineage,
-``.../lineage`` and ``.../provenance``, and reruns, ``.../rerun``."""
+"""Uploaded images, ``/v1/images``, and the products of their deconvolutions, ``/v1/products``; and for PSFs and
+products their lineage, ``.../lineage`` and ``.../provenance``, and reruns, ``.../rerun``.
+"""
 
 from __future__ import annotations
 
@@ -139,7 +140,8 @@ def get_product_thumbnail(product_id: Identity, request: Request, caller: Readin
     digest = state.row(ProductRow, product_id, caller.owner).details.get("thumbnail_sha256")
     missing = (
         "no-thumbnail",
-        "expected a product with a thumbnail; this one was made before products had one: use its preview, or delete the "
+        "expected a product with a thumbnail; this one was made before products had one: use its preview, or delete "
+        "the "
         "product and submit the job again",
     )
     return files.send(request, state.store, digest, "image/png", None, missing=missing)
@@ -147,7 +149,9 @@ def get_product_thumbnail(product_id: Identity, request: Request, caller: Readin
 
 @products.get("/{product_id}/changes", summary="Picture of all changes", response_class=Response)
 def get_product_changes(product_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
-    """A PNG that shows the image before and after, the change, difference, ratio and histogram, if the job had `changes_picture` true."""
+    """A PNG that shows the image before and after, the change, difference, ratio and histogram, if the job had
+    `changes_picture` true.
+    """
     digest = state.row(ProductRow, product_id, caller.owner).details.get("changes_picture_sha256")
     missing = (
         "no-changes-picture",
@@ -175,14 +179,17 @@ def delete_product(product_id: Identity, caller: Submitting, state: Shared) -> R
 
 @lineages.get("/v1/psfs/{psf_id}/lineage", summary="The lineage of a PSF")
 def get_psf_lineage(psf_id: Identity, caller: Reading, state: Shared) -> Ancestor:
-    """The inputs of the PSF (by hash), its parameters, the versions of software and libraries, and its job. The PSFs from which it
-    was made are described in the same way."""
+    """The inputs of the PSF (by hash), its parameters, the versions of software and libraries, and its job. The PSFs
+    from which it was made are described in the same way.
+    """
     return lineage(state.catalogue, state.row(PsfRow, psf_id, caller.owner))
 
 
 @lineages.get("/v1/products/{product_id}/lineage", summary="The lineage of a product")
 def get_product_lineage(product_id: Identity, caller: Reading, state: Shared) -> Ancestor:
-    """The image, the parameters, the versions of software and libraries, and the job of the product; also the lineage of its PSF."""
+    """The image, the parameters, the versions of software and libraries, and the job of the product; also the lineage
+    of its PSF.
+    """
     return lineage(state.catalogue, state.row(ProductRow, product_id, caller.owner))
 
 
@@ -204,7 +211,9 @@ def get_product_provenance(
 
 @in_turn(lineages.post("/v1/psfs/{psf_id}/rerun", status_code=202, summary="Make a PSF again and compare"))
 def rerun_psf(psf_id: Identity, response: Response, caller: Submitting, state: Shared) -> JobView:
-    """Submit a job that makes the PSF again with the same parameters. The result is a report on the differences between both PSFs."""
+    """Submit a job that makes the PSF again with the same parameters. The result is a report on the differences between
+    both PSFs.
+    """
     return _rerun("psf", psf_id, response, caller, state)
 
 
@@ -214,7 +223,9 @@ def rerun_psf(psf_id: Identity, response: Response, caller: Submitting, state: S
     )
 )
 def rerun_product(product_id: Identity, response: Response, caller: Submitting, state: Shared) -> JobView:
-    """Submit a job that makes the product again with the same parameters. The result is a report on the differences between both products."""
+    """Submit a job that makes the product again with the same parameters. The result is a report on the differences
+    between both products.
+    """
     return _rerun("product", product_id, response, caller, state)
 
 

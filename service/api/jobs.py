@@ -44,7 +44,8 @@ class EstimateView(BaseModel):
 
     parameters: dict[str, Any] = Field(description="the parameters, with every default and the PSF filled in")
     result_id: str = Field(
-        description="id that the result has, or would have; for a kind whose jobs always make a new result (`rerun`), this id is "
+        description="id that the result has, or would have; for a kind whose jobs always make a new result (`rerun`), "
+        "this id is "
         "different each time"
     )
     existing: str | None = Field(
@@ -62,7 +63,8 @@ class EstimateView(BaseModel):
     router.post(
         "",
         status_code=202,
-        summary="Submit a job: a deconvolution, a PSF build, a fit, a cross-validation, a report, a diagnosis or a rerun",
+        summary="Submit a job: a deconvolution, a PSF build, a fit, a cross-validation, a report, a diagnosis or a "
+        "rerun",
         responses={
             200: {
                 "model": JobView,
@@ -72,8 +74,9 @@ class EstimateView(BaseModel):
     )
 )
 def submit_job(body: JobRequest, response: Response, caller: Submitting, state: Shared) -> JobView:
-    """Put a job into its queue. If an identical request was made before, the answer is the existing job. If the result of that
-    job was deleted or lost, the job is queued again."""
+    """Put a job into its queue. If an identical request was made before, the answer is the existing job. If the result
+    of that job was deleted or lost, the job is queued again.
+    """
     parameters, request_key, estimate = prepared(body, caller, state)
     queue = None if body.queue is None else Queue(body.queue)
     row, new = state.catalogue.jobs.submit(
@@ -112,7 +115,8 @@ def _resolved(body: JobRequest, caller: Caller, state: Shared) -> tuple[dict[str
 
 @router.post("/identity", summary="The id that the result of a job has or would have")
 def get_identity(body: JobRequest, caller: Submitting, state: Shared) -> Identified:
-    """Resolve a request without starting a job. Equal requests have equal ids, so a client can skip results that it holds.
+    """Resolve a request without starting a job. Equal requests have equal ids, so a client can skip results that it
+    holds.
 
     For a kind whose jobs always make a new result (`rerun`), the id is different each time.
     """
@@ -124,7 +128,8 @@ def get_identity(body: JobRequest, caller: Submitting, state: Shared) -> Identif
 def estimate_job(body: JobRequest, caller: Submitting, state: Shared) -> EstimateView:
     """Estimate a job without starting it. The request and its errors are the same as for `POST /v1/jobs`. The answer
     contains the expected time and memory, the place in the queue and, for a deconvolution, the PSF and the reason for
-    its choice."""
+    its choice.
+    """
     parameters, result_id, estimate = prepared(body, caller, state)
     queue = queue_of(body.kind) if body.queue is None else Queue(body.queue)
     result = KINDS[body.kind].result
@@ -160,7 +165,9 @@ def get_job(job_id: JobId, caller: Reading, state: Shared) -> JobView:
 
 @router.delete("/{job_id}", status_code=202, summary="Cancel a job")
 def cancel_job(job_id: JobId, caller: Submitting, state: Shared) -> JobView:
-    """Cancel a job. A queued job ends at once. An executing job ends at its next step. A job that has ended does not change."""
+    """Cancel a job. A queued job ends at once. An executing job ends at its next step. A job that has ended does not
+    change.
+    """
     check_own(find(state, caller, job_id))
     state.catalogue.jobs.cancel(job_id)
     return JobView.of(find(state, caller, job_id))
@@ -174,13 +181,15 @@ def _view(row: JobRow, state: Shared) -> JobView:
 
 def check_own(row: JobRow) -> JobRow:
     """The job itself. Raises ``Problem`` 409 if the job is a part of a bulk run: only requests to the bulk run can
-    change it."""
+    change it.
+    """
     if KINDS[row.kind].parameters is None:
         bulk_id = row.parameters["bulk_id"]
         raise Problem(
             409,
             "job-of-bulk",
-            f"expected a job that was submitted; job {row.id} is a part of bulk run {bulk_id}: pause or cancel the bulk run "
+            f"expected a job that was submitted; job {row.id} is a part of bulk run {bulk_id}: pause or cancel the "
+            "bulk run "
             f"(POST /v1/bulk/{bulk_id}/pause or /cancel)",
         )
     return row

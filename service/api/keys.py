@@ -105,7 +105,8 @@ def list_keys(
         str | None,
         Query(
             pattern=rf"^(\*|{OWNER.pattern})$",
-            description="owner of the keys; `*`: all owners. To list the keys of another owner, you need the scope admin",
+            description="owner of the keys; `*`: all owners. To list the keys of another owner, you need the scope "
+            "admin",
         ),
     ] = None,
 ) -> Page[KeyView]:
@@ -120,7 +121,8 @@ def list_keys(
 @router.post("", status_code=201, summary="Make a key")
 def make_key(body: NewKey, response: Response, caller: Submitting, state: Shared) -> MadeKey:
     """Make a key. Only this answer contains the whole key. If your own key does not have the scope admin, the new key
-    can have only scopes of your own key, and does not last longer than your own key."""
+    can have only scopes of your own key, and does not last longer than your own key.
+    """
     _check_used(state)
     owner = body.owner or caller.owner
     _check_for(caller, owner)
@@ -139,7 +141,8 @@ def make_key(body: NewKey, response: Response, caller: Submitting, state: Shared
         raise Problem(
             409,
             "too-many-keys",
-            f"expected at most {MOST_KEYS} valid keys of an owner; {owner} already has that number: revoke a key that is "
+            f"expected at most {MOST_KEYS} valid keys of an owner; {owner} already has that number: revoke a key that "
+            "is "
             "not used",
         ) from error
     row = state.catalogue.keys.get(key.split("_")[1])
@@ -169,7 +172,8 @@ def revoke_key(
 ) -> KeyView:
     """Revoke a key. From now on, the service refuses requests with this key, and ends its logins in browsers and its
     event streams. Jobs that were submitted with the key continue. To revoke a key with scopes that your own key does
-    not have, you need the scope admin."""
+    not have, you need the scope admin.
+    """
     row = _find(state, caller, key_id)
     _check_scopes(caller, map(Scope, row.scopes), "use a key with these scopes, or ask the operator")
     state.catalogue.keys.revoke(key_id, and_made=and_made)
@@ -197,7 +201,8 @@ def _check_used(state: Shared) -> None:
         raise Problem(
             409,
             "keys-not-used",
-            "expected a service that requires keys; this one is open to everybody and uses no keys: send requests without a key",
+            "expected a service that requires keys; this one is open to everybody and uses no keys: send requests "
+            "without a key",
         )
 
 
@@ -216,14 +221,16 @@ def _check_scopes(caller: Caller, scopes: Iterable[Scope], advice: str) -> None:
         raise Problem(
             403,
             "scope-missing",
-            f"expected scopes of your own key ({', '.join(sorted(caller.scopes))}); got also {', '.join(sorted(lacking))}: "
+            f"expected scopes of your own key ({', '.join(sorted(caller.scopes))}); got also "
+            f"{', '.join(sorted(lacking))}: "
             f"{advice}",
         )
 
 
 def _end(state: Shared, caller: Caller, body: NewKey) -> float | None:
     """The end of a new key. Raises ``Problem`` 422 if this end is in the past, and 403 if it is later than the end of
-    the caller's key."""
+    the caller's key.
+    """
     now = time.time()
     end = body.expires_at if body.lasts_days is None else now + body.lasts_days * DAY_S
     if end is not None and end <= now:
@@ -238,7 +245,8 @@ def _end(state: Shared, caller: Caller, body: NewKey) -> float | None:
         raise Problem(
             403,
             "outlives-its-maker",
-            f"expected an end that is not later than that of your own key ({latest:.0f}); got {end:.0f}: choose an earlier end, "
+            f"expected an end that is not later than that of your own key ({latest:.0f}); got {end:.0f}: choose an "
+            "earlier end, "
             "or ask the operator for a key",
         )
     return latest if end is None else end

@@ -1,7 +1,7 @@
 """The contents of the files of images and products: pixels, ``.../pixels``, and headers, ``.../header``.
 
-Pixels are raw numbers, so that a viewer can show exact values. The first request for a plane decodes it; later requests read the decoded plane (``psfcore.fits.viewing``). The first
-request for pixels loads the numerical libraries.
+Pixels are raw numbers, so that a viewer can show exact values. The first request for a plane decodes it; later requests
+read the decoded plane (``psfcore.fits.viewing``). The first request for pixels loads the numerical libraries.
 """
 
 from __future__ import annotations
@@ -59,7 +59,8 @@ class Part:
         Query(
             ge=1,
             le=LARGEST,
-            description="n: each number of the answer stands for a block of n x n pixels. The number is the mean of the finite "
+            description="n: each number of the answer stands for a block of n x n pixels. The number is the mean of "
+            "the finite "
             "pixels; for `quality`, the bitwise OR. Blocks at the last rows and columns of the window may be smaller",
         ),
     ] = 1
@@ -97,7 +98,9 @@ async def get_image_pixels(
     part: Window,
     plane: Annotated[Literal["image"], Query(description="an uploaded image has one plane")] = "image",
 ) -> Response:
-    """The pixel values of the file, in DN or DN/s as they are stored (BSCALE and BZERO applied). Saturated pixels are not marked."""
+    """The pixel values of the file, in DN or DN/s as they are stored (BSCALE and BZERO applied). Saturated pixels are
+    not marked.
+    """
     await run_in_threadpool(state.row, ImageRow, image_id, caller.owner)
     return await _pixels(request, state, caller.owner, image_id, plane, part)
 
@@ -121,8 +124,9 @@ async def get_product_pixels(
         ),
     ] = "image",
 ) -> Response:
-    """The pixel values of a plane of the product. Values of `quality` are whole numbers, as in the file. 404: the product does not
-    have this plane."""
+    """The pixel values of a plane of the product. Values of `quality` are whole numbers, as in the file. 404: the
+    product does not have this plane.
+    """
     row = await run_in_threadpool(state.row, ProductRow, product_id, caller.owner)
     return await _pixels(request, state, caller.owner, row.file_sha256, plane, part)
 
@@ -157,8 +161,9 @@ async def prepare_image(state: State, owner: str, digest: str) -> None:
 async def picture_of(
     request: Request, state: State, owner: str, digest: str, core_px: int | None = None
 ) -> Response:
-    """A picture of the image in a stored file as PNG, or 304 if the client already has it. core_px: of the central part of a
-    PSF, with this width."""
+    """A picture of the image in a stored file as PNG, or 304 if the client already has it. core_px: of the central part
+    of a PSF, with this width.
+    """
     sent = files.headers_of(f"{ANSWERS_VERSION} {digest} picture {core_px}")
     if (same := files.not_modified(request, sent)) is not None:
         return same
@@ -204,7 +209,8 @@ class HduHeader(BaseModel):
     index: int = Field(description="number of the HDU, counted from 0")
     name: str = Field(description="EXTNAME; empty: the HDU has no name")
     cards: list[tuple[str, str | int | float | bool | None, str]] = Field(
-        description="keyword, value and comment of each card, in the order of the file; value null: the card has no value"
+        description="keyword, value and comment of each card, in the order of the file; value null: the card has no "
+        "value"
     )
 
 
@@ -212,7 +218,9 @@ class HduHeader(BaseModel):
     "/v1/images/{image_id}/header", summary="All headers of an uploaded image", response_model=list[HduHeader]
 )
 async def get_image_header(image_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
-    """Every card of every HDU, with COMMENT and HISTORY. A tile-compressed image has the header of the table that holds it."""
+    """Every card of every HDU, with COMMENT and HISTORY. A tile-compressed image has the header of the table that holds
+    it.
+    """
     row = await run_in_threadpool(state.row, ImageRow, image_id, caller.owner)
     return await _headers(request, state, caller.owner, image_id, row.bytes)
 

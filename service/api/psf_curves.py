@@ -1,6 +1,7 @@
 """Curves and weights of a PSF, under ``/v1/psfs/{id}``, read from its stored tables.
 
-A job makes the tables when it builds or fits a PSF. An uploaded PSF has no tables until a job ``psf-tables`` makes them. The upload does not make them, because the web process does no numerical work.
+A job makes the tables when it builds or fits a PSF. An uploaded PSF has no tables until a job ``psf-tables`` makes
+them. The upload does not make them, because the web process does no numerical work.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""The versions of PSFs: their status and validity, ``/v1/psfs/{id}/status``; whether the PSFs of a series may be interpolated in time,
-``/v1/series``; the products that were made with deprecated PSFs, ``/v1/affected`` and ``/v1/psfs/{id}/affected``; and contexts,
-immutable sets of PSFs, ``/v1/contexts``."""
+"""The versions of PSFs: their status and validity, ``/v1/psfs/{id}/status``; whether the PSFs of a series may be
+interpolated in time, ``/v1/series``; the products that were made with deprecated PSFs, ``/v1/affected`` and
+``/v1/psfs/{id}/affected``; and contexts, immutable sets of PSFs, ``/v1/contexts``.
+"""
 
 from __future__ import annotations
 
@@ -77,7 +78,9 @@ class StatusView(RowView):
 
 @router.get("/{psf_id}/status", summary="A PSF's status and its history")
 def get_psf_status(psf_id: Identity, caller: Reading, state: Shared) -> StatusView:
-    """The status of a PSF, the changes that are allowed now, and the past changes: who made each change, when and why."""
+    """The status of a PSF, the changes that are allowed now, and the past changes: who made each change, when and
+    why.
+    """
     return _view(state, caller, state.row(PsfRow, psf_id, caller.owner))
 
 
@@ -167,8 +170,9 @@ def change_series(
 ) -> SeriesView:
     """Say whether the PSFs of a series may be interpolated in time.
 
-    If they may, a deconvolution that names no PSF interpolates for images whose time is between the ranges of two certified
-    PSFs. Both PSFs must have been fitted with the same shape and the same diffraction PSF. Existing contexts do not change.
+    If they may, a deconvolution that names no PSF interpolates for images whose time is between the ranges of two
+    certified PSFs. Both PSFs must have been fitted with the same shape and the same diffraction PSF. Existing contexts
+    do not change.
     """
     name = f"{instrument}/{channel}/{kind}"
     with as_problems():
@@ -201,7 +205,8 @@ class AffectedView(RowView):
     psf_status: str
     successor: str | None
     redo_with: str | None = Field(
-        description="id of the replacement PSF, which is the certified PSF at the end of the chain of successors; null: there is no replacement"
+        description="id of the replacement PSF, which is the certified PSF at the end of the chain of successors; "
+        "null: there is no replacement"
     )
 
     @classmethod
@@ -272,7 +277,8 @@ class PinView(BaseModel):
     psf_id: str
     version: str = Field(description="version of the PSF when it was pinned")
     interpolated: bool = Field(
-        description="whether the PSFs of this series may be interpolated in this context, as for the series when the context was created"
+        description="whether the PSFs of this series may be interpolated in this context, as for the series when the "
+        "context was created"
     )
 
 

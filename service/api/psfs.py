@@ -1,4 +1,6 @@
-"""PSF versions, ``/v1/psfs``: list, upload, show and delete them, and find the one PSF that meets filters or fits an image."""
+"""PSF versions, ``/v1/psfs``: list, upload, show and delete them, and find the one PSF that meets filters or fits an
+image.
+"""
 
 from __future__ import annotations
 
@@ -79,7 +81,8 @@ def psf_filter(
         raise Problem(
             422,
             "not-valid-at-any-time",
-            f"valid_at: expected it only with certified PSFs; got valid_at with status {status}: remove valid_at or status",
+            f"valid_at: expected it only with certified PSFs; got valid_at with status {status}: remove valid_at or "
+            "status",
         )
     with as_problems():
         at = None if valid_at is None else seconds(valid_at, "valid_at")
@@ -108,8 +111,8 @@ class Choice(BaseModel):
 def get_best_psf(caller: Reading, state: Shared, filters: Filters, context: InContext = None) -> Choice:
     """The PSF with these properties. Without a status and a context, only certified PSFs are searched.
 
-    404: no PSF meets all filters; the message names the filter that excluded the last PSFs. 409: several PSFs meet the filters; the
-    message lists them.
+    404: no PSF meets all filters; the message names the filter that excluded the last PSFs. 409: several PSFs meet the
+    filters; the message lists them.
     """
     return _choice(lambda: look(state.catalogue, filters, caller.owner, context))
 
@@ -122,7 +125,8 @@ def get_psf_for_image(
     context: InContext = None,
     kind: Annotated[str, Query(pattern=WORD)] = TOTAL,
 ) -> Choice:
-    """The certified PSF for the instrument, channel and time of observation in the image's header, or the PSF that a context pins.
+    """The certified PSF for the instrument, channel and time of observation in the image's header, or the PSF that a
+    context pins.
 
     `POST /v1/estimates` says which PSF a deconvolution would use, also if none is certified.
     """
@@ -213,7 +217,9 @@ def _made_here(state: Shared, caller: Caller, digest: str) -> PsfRow | None:
 def list_psfs(
     paging: Paging, caller: Reading, state: Shared, filters: Filters, context: InContext = None
 ) -> Page[PsfView]:
-    """PSFs, newest first. With `valid_at`: only PSFs that are certified for this time, or that the context pins for this time."""
+    """PSFs, newest first. With `valid_at`: only PSFs that are certified for this time, or that the context pins for
+    this time.
+    """
     if context == NOW:
         filters = replace(filters, status=PsfStatus.CERTIFIED)
     elif context is not None:
@@ -256,7 +262,8 @@ def get_psf_preview(psf_id: Identity, request: Request, caller: Reading, state: 
     digest = state.row(PsfRow, psf_id, caller.owner).preview_sha256
     missing = (
         "no-preview",
-        "expected a PSF with a picture; an uploaded PSF has no picture until a job psf-tables draws it: submit that job",
+        "expected a PSF with a picture; an uploaded PSF has no picture until a job psf-tables draws it: submit that "
+        "job",
     )
     return files.send(request, state.store, digest, "image/png", None, missing=missing)
 

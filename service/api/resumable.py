@@ -1,8 +1,8 @@
 """Uploads that continue after a cut of the connection, by the tus protocol 1.0: ``/v1/uploads``.
 
 Extensions: creation, termination, expiration, checksum. See https://tus.io/protocols/resumable-upload. The metadata
-``kind`` says what is uploaded ("transit" or "image"). If the metadata ``sha256`` declares the SHA-256 of the whole file,
-the service checks it, and a second request for the same file gets the upload that is open already.
+``kind`` says what is uploaded ("transit" or "image"). If the metadata ``sha256`` declares the SHA-256 of the whole
+file, the service checks it, and a second request for the same file gets the upload that is open already.
 """
 
 from __future__ import annotations
@@ -94,8 +94,8 @@ def tus_options(caller: Submitting, state: Shared) -> Response:
 def begin_upload(request: Request, caller: Submitting, state: Shared) -> Response:
     """Begin an upload. `Location` is its address; send the bytes there with `PATCH`.
 
-    If the file with the declared `sha256` was uploaded before, the answer has its address in `Content-Location`, and no bytes
-    are needed.
+    If the file with the declared `sha256` was uploaded before, the answer has its address in `Content-Location`, and no
+    bytes are needed.
     """
     _check_version(request)
     length = _number(request, "upload-length")
@@ -148,11 +148,12 @@ def upload_offset(upload_id: UploadId, request: Request, caller: Submitting, sta
     openapi_extra=_PART_BODY,
 )
 async def send_part(upload_id: UploadId, request: Request, caller: Submitting, state: Shared) -> Response:
-    """Send the bytes from `Upload-Offset` on. The answer to the last bytes has the address of the file in `Content-Location`.
+    """Send the bytes from `Upload-Offset` on. The answer to the last bytes has the address of the file in
+    `Content-Location`.
 
-    If the connection is cut, the bytes that arrived are kept; those of a request with `Upload-Checksum` are not, because they
-    cannot be checked. The answer is 409 if the offset is another one, 460 if the checksum does not fit, and 423 if another
-    request sends bytes now.
+    If the connection is cut, the bytes that arrived are kept; those of a request with `Upload-Checksum` are not,
+    because they cannot be checked. The answer is 409 if the offset is another one, 460 if the checksum does not fit,
+    and 423 if another request sends bytes now.
     """
     if request.headers.get("content-type", "") != PART:
         raise Problem(415, "bad-upload", f"expected Content-Type: {PART}; got another one")
@@ -179,7 +180,9 @@ def delete_upload(upload_id: UploadId, request: Request, caller: Submitting, sta
 
 
 async def _append(request: Request, file: BinaryIO, upload: PartialUpload, take: Allowed) -> None:
-    """Append the body to the received bytes. Raises ``Problem`` 413 and 460; then the bytes of this request are removed."""
+    """Append the body to the received bytes. Raises ``Problem`` 413 and 460; then the bytes of this request are
+    removed.
+    """
     offset, declared, whole = file.tell(), request.headers.get("upload-checksum"), False
     algorithm, _, value = (declared or "").partition(" ")
     if declared is not None and algorithm not in ALGORITHMS:
@@ -270,7 +273,8 @@ def _not_open(upload_id: str) -> Problem:
     return Problem(
         404,
         "no-such-upload",
-        f"expected the id of an open upload; got {upload_id}, which was completed, deleted or has expired: begin the upload "
+        f"expected the id of an open upload; got {upload_id}, which was completed, deleted or has expired: begin the "
+        "upload "
         "again",
     )
 

@@ -89,7 +89,9 @@ def get_report_preview(report_id: Identity, request: Request, caller: Reading, s
 
 @reports.get("/{report_id}/page", summary="The report as an HTML page", response_class=Response)
 def get_report_page(report_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
-    """The report as HTML with its figures inside. The headers of the answer forbid scripts and content from other addresses."""
+    """The report as HTML with its figures inside. The headers of the answer forbid scripts and content from other
+    addresses.
+    """
     digest = state.row(ReportRow, report_id, caller.owner).details.get("page_sha256")
     missing = _without("no-page", "with a page; this report has no page", report_id)
     answer = files.send(request, state.store, digest, "text/html; charset=utf-8", None, missing=missing)

@@ -55,7 +55,9 @@ def _condition(text: str) -> tuple[str, str, Any]:
 
 @click.group(short_help="Deconvolve many images on a service.")
 def bulk() -> None:
-    """Deconvolve many images on a service in the same way: your own images, or files of an archive that the service can read."""
+    """Deconvolve many images on a service in the same way: your own images, or files of an archive that the service can
+    read.
+    """
 
 
 @bulk.command("submit", short_help="Start a bulk run.")
@@ -96,9 +98,9 @@ def submit(
 ) -> None:
     """Start a bulk run: deconvolve the files on the machine of the service that match PATTERNS.
 
-    A pattern is an absolute path in a folder that the operator allows. * ? and [ab] match parts of a name, ** matches any
-    number of folders. Put the pattern in quotation marks. Choose the PSF with either --psf or --context. If the service
-    refuses files of --upload, the command names them, starts the run with the others, and ends with status 1.
+    A pattern is an absolute path in a folder that the operator allows. * ? and [ab] match parts of a name, ** matches
+    any number of folders. Put the pattern in quotation marks. Choose the PSF with either --psf or --context. If the
+    service refuses files of --upload, the command names them, starts the run with the others, and ends with status 1.
 
     --dry-run examines the headers of a sample of the images and starts nothing; it ends with status 1 if the run would
     refuse an examined image.
@@ -148,7 +150,8 @@ def list_bulks(service: Client, most: int) -> None:
 
     def line(row: Row) -> str:
         return (
-            f"{short(row['id'])}  {row['phase']:<9}  {moment(row['created_at'])}  {row['done']} of {_total(row, row['total'])} done, "
+            f"{short(row['id'])}  {row['phase']:<9}  {moment(row['created_at'])}  {row['done']} of "
+            f"{_total(row, row['total'])} done, "
             f"{row['failed']} failed  {row['name']}"
         )
 
@@ -231,7 +234,9 @@ def report(
 
 
 def _upload(service: Client, files: Sequence[Path]) -> tuple[list[str], int]:
-    """Upload files; returns the ids of the images, and how many files were refused. Each refused file is named on standard error."""
+    """Upload files; returns the ids of the images, and how many files were refused. Each refused file is named on
+    standard error.
+    """
     uploaded: list[str] = []
     for file in files:
         try:
@@ -265,8 +270,8 @@ def _print_estimate(estimate: Row) -> None:
         f"{estimate['images']} images, about {duration(estimate['seconds'])} with {workers} worker "
         f"{'process' if workers == 1 else 'processes'}, at most {estimate['memory_mib']} MiB of memory for one image",
         f"products: about {estimate['output_bytes'] / 2**20:.1f} MiB, without their pictures",
-        f"examined: {estimate['examined']} of {estimate['images']} images; {estimate['refused_images']} would be refused"
-        + (f", {estimate['existing']} products exist already" if estimate["existing"] else ""),
+        f"examined: {estimate['examined']} of {estimate['images']} images; {estimate['refused_images']} would be "
+        "refused" + (f", {estimate['existing']} products exist already" if estimate["existing"] else ""),
     ]
     if estimate["example_output"]:
         lines.append(f"for example: {estimate['example_output']}")
@@ -315,7 +320,8 @@ def _line(row: dict[str, Any]) -> str:
 
 def _where(conditions: Sequence[tuple[str, str, Any]]) -> dict[str, Any]:
     """The conditions in the form that the request needs. If a keyword has several values, one of these values is
-    enough."""
+    enough.
+    """
     where: dict[str, Any] = {}
     for key, sign, value in conditions:
         before = where.get(key)
@@ -333,8 +339,9 @@ def _where(conditions: Sequence[tuple[str, str, Any]]) -> dict[str, Any]:
 
 
 def _value(text: str) -> bool | int | float | str:
-    """The value of a text: T or F is a logical value, a number is a number, anything else is a text. Quotation marks make any value
-    a text."""
+    """The value of a text: T or F is a logical value, a number is a number, anything else is a text. Quotation marks
+    make any value a text.
+    """
     if text in ("T", "F"):
         return text == "T"
     for kind in (int, float):

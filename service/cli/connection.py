@@ -36,8 +36,9 @@ Row = dict[str, Any]
 
 
 class _Id(click.ParamType):
-    """An id, or its first digits. or_file: or the name of a file with a PSF. or_instrument: or an instrument, whose PSF is
-    built: its name, or its file (TOML); or the name of a published PSF."""
+    """An id, or its first digits. or_file: or the name of a file with a PSF. or_instrument: or an instrument, whose PSF
+    is built: its name, or its file (TOML); or the name of a published PSF.
+    """
 
     name = "id"
 
@@ -45,7 +46,9 @@ class _Id(click.ParamType):
         self.or_file, self.or_instrument = or_file, or_instrument
 
     def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """The digits in lower case, or the name of the file. Other texts never become part of an address of the service."""
+        """The digits in lower case, or the name of the file. Other texts never become part of an address of the
+        service.
+        """
         text = str(value)
         if self.or_file and Path(text).is_file():
             return text
@@ -67,7 +70,8 @@ class _Id(click.ParamType):
 
 
 def server_option(what: str, *, or_local: bool = False) -> Callable[[Command], Command]:
-    """The options ``--server`` and ``--key`` of a command that can send a request to a service; or_local: and ``--local``.
+    """The options ``--server`` and ``--key`` of a command that can send a request to a service; or_local: and
+    ``--local``.
 
     The command does not get their values: `connection`, `remote` and `is_local` find them in the context.
     """
@@ -104,7 +108,8 @@ _ADDRESS = "Address of the service, which this command needs"
 SERVER, SERVER_OR_LOCAL = server_option(_ADDRESS), server_option(_ADDRESS, or_local=True)
 SERVER_FOR_IDS = server_option("Address of the service, which is needed only if a PSF is given by its id")
 PSF = psf_option(
-    "PSF: an id or a file; an instrument (aia_171, FILE.toml); or a published PSF (aia_171_2025) [default: the certified PSF for the image, else the one built]",
+    "PSF: an id or a file; an instrument (aia_171, FILE.toml); or a published PSF (aia_171_2025) [default: the "
+    "certified PSF for the image, else the one built]",
     or_instrument=True,
 )
 CONTEXT = options_of(Deconvolve, "context")
@@ -123,8 +128,9 @@ def short(identity: str) -> str:
 
 
 def remote() -> Client:
-    """A client of the service that ``--server`` or HELIOPSF_SERVER names, with the key of ``--key`` or HELIOPSF_KEY, if one is
-    given."""
+    """A client of the service that ``--server`` or HELIOPSF_SERVER names, with the key of ``--key`` or HELIOPSF_KEY, if
+    one is given.
+    """
     from service.client.http import Client
 
     options = click.get_current_context().meta
@@ -132,7 +138,9 @@ def remote() -> Client:
 
 
 def on_service(command: Command) -> Command:
-    """Give a command the options ``--server`` and ``--key``, and the client of the service as the argument ``service``."""
+    """Give a command the options ``--server`` and ``--key``, and the client of the service as the argument
+    ``service``.
+    """
 
     @SERVER
     @wraps(command)
@@ -180,7 +188,9 @@ def whole_id(service: Operations, things: str, identity: str) -> str:
 
 @contextmanager
 def psf_file(psf: str) -> Iterator[Path]:
-    """The file of the PSF that the user named. If the user named an id, the file is downloaded to a temporary folder."""
+    """The file of the PSF that the user named. If the user named an id, the file is downloaded to a temporary
+    folder.
+    """
     if not is_psf_id(psf):
         yield Path(psf)
         return
@@ -192,7 +202,8 @@ def psf_file(psf: str) -> Iterator[Path]:
 
 def named_psf(service: Operations, psf: str | None) -> str | None:
     """The id of the PSF that the user named with ``--psf``; a file is uploaded first, the PSF of an instrument is
-    built, and a published PSF is uploaded if the service has none of this name."""
+    built, and a published PSF is uploaded if the service has none of this name.
+    """
     if psf is None:
         return None
     if psf.endswith(".toml") or (psf in instrument_names() and is_psf_id(psf)):

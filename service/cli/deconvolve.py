@@ -1,5 +1,6 @@
-"""The commands ``deconvolve``, which deconvolves one image into a file, or many images into a folder, and ``changes``, which
-deconvolves several images and shows what changed, with the highest artefact scores first."""
+"""The commands ``deconvolve``, which deconvolves one image into a file, or many images into a folder, and ``changes``,
+which deconvolves several images and shows what changed, with the highest artefact scores first.
+"""
 
 from __future__ import annotations
 
@@ -82,7 +83,8 @@ def deconvolve(
 ) -> None:
     """Deconvolve IMAGES (FITS files, or folders of them) with the PSF of their instrument, or with yours.
 
-    The output is a folder for several images, or if its name ends in /. Images whose product is in the folder are skipped.
+    The output is a folder for several images, or if its name ends in /. Images whose product is in the folder are
+    skipped.
     """
     files = _fits_files(images)
     if timings and not is_local():
@@ -244,7 +246,8 @@ def _one_by_one(
     service: Operations, parameters: dict[str, Any], products: dict[str, dict[str, Any]]
 ) -> Callable[[str], Treated]:
     """A function that deconvolves one image with the service and measures what changed. The function adds the ids of
-    the products to ``products``."""
+    the products to ``products``.
+    """
     from psfcore.deconvolve.assess.pictures import changes_in_product
 
     def one(name: str) -> Treated:
@@ -279,6 +282,7 @@ def _lines(content: dict[str, Any]) -> list[str]:
     lines += [f"not deconvolved: {failure['name']}: {failure['reason']}" for failure in content["failures"]]
     summary = content["summary"]
     lines.append(
-        f"{counted(summary['images'], 'image')}, {summary['to_look_at']} to look at, {summary['failures']} not deconvolved"
+        f"{counted(summary['images'], 'image')}, {summary['to_look_at']} to look at, {summary['failures']} not "
+        "deconvolved"
     )
     return lines

@@ -44,7 +44,8 @@ THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 EXTRAS = ("service", "published", "plot")  # the commands need all packages of these extras
 HIDDEN = "the URL that is set"  # in place of a URL that may contain a password in any part
 LITTLE_ROOM_BYTES = 5 * 2**30
-# The first patch of each Python that reads long cookies (CVE-2024-7592) and headers of tar files (CVE-2024-6232) in linear time.
+# The first patch of each Python that reads long cookies (CVE-2024-7592) and headers of tar files (CVE-2024-6232) in
+# linear time.
 LINEAR_PYTHONS = {(3, 11): 10, (3, 12): 6}
 # The finding and the advice for a database at another revision; "": the advice is that of the schema.
 OTHER_REVISIONS: dict[str, tuple[State, str]] = {
@@ -72,7 +73,9 @@ class Finding:
 @DATA
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON")
 def doctor(data: Path | None, as_json: bool) -> None:
-    """Check versions, settings, kernels, disk, database, broker and workers, and say what to do. If something is broken, the exit status is 1."""
+    """Check versions, settings, kernels, disk, database, broker and workers, and say what to do. If something is
+    broken, the exit status is 1.
+    """
     findings = examine(read_settings(data))
     broken = any(finding.state == "broken" for finding in findings.values())
     if as_json:
@@ -187,7 +190,8 @@ def threads(settings: Settings, cpu_quota: Path = CPU_QUOTA) -> Finding:
             advice.append(f"set {name} to {share} or less")
     if processes * settings.threads > may_use:
         advice.append(
-            f"more threads than cores slow each other down: set HELIOPSF_WORKER_THREADS={share}, or start fewer processes"
+            f"more threads than cores slow each other down: set HELIOPSF_WORKER_THREADS={share}, or start fewer "
+            "processes"
         )
     return Finding("warning" if advice else "ok", found, "; ".join(advice))
 
@@ -368,7 +372,10 @@ def stuck_jobs(settings: Settings, catalogue: Catalogue) -> Finding:
     try:
         checks.jobs(catalogue, settings)
     except checks.Unusable as fault:
-        advice = "restart the workers with the broker of the server, for all queues (HELIOPSF_WORKER_QUEUES), and read their logs"
+        advice = (
+            "restart the workers with the broker of the server, for all queues (HELIOPSF_WORKER_QUEUES), and "
+            "read their logs"
+        )
         return Finding("broken", str(fault), advice)
     silent = catalogue.census.count_silent(settings.lease_s + 5 * settings.reconcile_s)
     left = catalogue.census.count_unsubmitted(max(30.0, 5 * settings.reconcile_s))

@@ -184,7 +184,9 @@ def get(
 @IDS
 @on_service
 def delete(service: Client, identities: tuple[str, ...]) -> None:
-    """Delete products from the service, so that they no longer count in your quota. The same request makes them again."""
+    """Delete products from the service, so that they no longer count in your quota. The same request makes them
+    again.
+    """
     for identity in identities:
         whole = whole_id(service, "products", identity)
         service.delete_product(whole)

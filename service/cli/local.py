@@ -1,8 +1,8 @@
 """Commands with ``--local``: the requests to a service, answered in this process by the functions that a service and
 Python use too, without catalogue and store.
 
-`Local` reads the user's files where they are and gives them the ids that a service would give. A result is written only when
-the command names a file for the result.
+`Local` reads the user's files where they are and gives them the ids that a service would give. A result is written only
+when the command names a file for the result.
 """
 
 from __future__ import annotations
@@ -67,8 +67,9 @@ _NOW = "now"  # the context that a service without contexts has too
 
 @dataclass
 class Local(Operations):
-    """The requests of a command. folder: for temporary files. gap_effects: files and modules that add effects to the gap
-    library."""
+    """The requests of a command. folder: for temporary files. gap_effects: files and modules that add effects to the
+    gap library.
+    """
 
     folder: Path
     gap_effects: str = ""
@@ -107,7 +108,9 @@ class Local(Operations):
         return {"id": transit.sha256}
 
     def upload_psf(self, path: str | Path, **described: Any) -> dict[str, Any]:
-        """Add a PSF, and read it. As in a service, a PSF that heliopsf made keeps its id. No command describes the PSF anew."""
+        """Add a PSF, and read it. As in a service, a PSF that heliopsf made keeps its id. No command describes the PSF
+        anew.
+        """
         assert not any(described.values())
         path = Path(path)
         summary = read_summary(path, LIMITS)
@@ -138,7 +141,9 @@ class Local(Operations):
         return self._resolved(kind, parameters)[1]
 
     def wait(self, job: dict[str, Any], *, progress: Progress | None = None) -> dict[str, Any]:
-        """Compute the result of a request. The progress of a job that counts several times is the percent of its estimated time."""
+        """Compute the result of a request. The progress of a job that counts several times is the percent of its
+        estimated time.
+        """
         request, started_s = self._jobs.pop(job["id"]), time.monotonic()
         expected_s = self._expected_s(job["kind"], request)
 
@@ -220,7 +225,9 @@ class Local(Operations):
         return build
 
     def _resolved_on_transit(self, request: Any) -> dict[str, Any]:
-        """The further fields of a resolved request on a transit, as ``workers.intake.requests`` finds them in a catalogue."""
+        """The further fields of a resolved request on a transit, as ``workers.intake.requests`` finds them in a
+        catalogue.
+        """
         manifest = vars(self.inputs.transits[request.transit_id].contents.manifest)
         if isinstance(request, Report) and request.psf_id is not None:
             check_noise(manifest, request.noise)
@@ -241,7 +248,8 @@ class Local(Operations):
         if request.context not in (None, _NOW):
             raise DataError(
                 "no-such-context",
-                f"expected the id or name of a context; got {request.context!r}, which does not exist: list the contexts",
+                f"expected the id or name of a context; got {request.context!r}, which does not exist: list the "
+                "contexts",
             )
         psf: dict[str, Any] = {"psf_id": request.psf_id}
         if request.psf_id is None:

@@ -1,5 +1,6 @@
-"""The workspace of a command with ``--local``: the user's files where they are, the user's cache of built PSFs, and results whose
-files are written when the command asks for them."""
+"""The workspace of a command with ``--local``: the user's files where they are, the user's cache of built PSFs, and
+results whose files are written when the command asks for them.
+"""
 
 from __future__ import annotations
 
@@ -75,7 +76,9 @@ class PsfFile(ImageFile):
     version: str
 
     def seen_as(self, psf: Psf) -> Psf:
-        """The PSF with the name, the version, the instrument and the wavelength that an upload would get from the header."""
+        """The PSF with the name, the version, the instrument and the wavelength that an upload would get from the
+        header.
+        """
         instrument = psf.instrument or instrument_of(asdict(self.summary))
         channel = channel_of(instrument, self.summary.wavelnth) or ""
         angstrom = psf.wavelength_angstrom
@@ -117,8 +120,8 @@ class TransitFiles:
 class Inputs:
     """What the user added to a command, and what was made of it, by the ids that a service would give.
 
-    builds: PSFs that are built when they are needed. psfs_read: by id and whether with components; a PSF is read once. results: by
-    type and id.
+    builds: PSFs that are built when they are needed. psfs_read: by id and whether with components; a PSF is read once.
+    results: by type and id.
     """
 
     images: dict[str, ImageFile] = field(default_factory=dict)

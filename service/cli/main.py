@@ -1,5 +1,5 @@
-"""The commands ``heliopsf`` and ``heliopsf psf``: they list all commands, and the file of each command. A command is imported when it
-is called, so that ``heliopsf --version`` is fast.
+"""The commands ``heliopsf`` and ``heliopsf psf``: they list all commands, and the file of each command. A command is
+imported when it is called, so that ``heliopsf --version`` is fast.
 """
 
 from __future__ import annotations
@@ -67,7 +67,9 @@ class LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """The command that the arguments call. If there is none, the ``UsageError`` names the command that the user may mean."""
+        """The command that the arguments call. If there is none, the ``UsageError`` names the command that the user may
+        mean.
+        """
         name = args[0]
         if name not in self.rows and not name.startswith("-"):
             close = get_close_matches(name, self.rows, n=1)
@@ -76,7 +78,8 @@ class LazyGroup(click.Group):
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run a command. Control-C ends it with status 130; if its job continues, a message says how to return to the job.
+        """Run a command. Control-C ends it with status 130; if its job continues, a message says how to return to the
+        job.
 
         The message of an error may contain texts of a service or a file; it is made printable.
         """

@@ -42,10 +42,12 @@ DEFAULT_SCOPES = (Scope.READ, Scope.SUBMIT)
 SENTENCES = {
     "empty": "the database is empty; the first start of a server makes its tables at revision {wanted}",
     "unversioned": "the database has tables without a revision; this version needs revision {wanted}",
-    "obsolete": "the database is at revision {revision} of a development version, which this version cannot upgrade; it needs {wanted}",
+    "obsolete": "the database is at revision {revision} of a development version, which this version cannot upgrade; "
+    "it needs {wanted}",
     "older": "the database is at revision {revision}; this version needs {wanted}",
     "current": "the database is at revision {revision}, which this version needs",
-    "newer": "the database is at revision {revision} of a later version of heliopsf; this version knows revisions up to {wanted}",
+    "newer": "the database is at revision {revision} of a later version of heliopsf; this version knows revisions up "
+    "to {wanted}",
 }
 
 
@@ -83,7 +85,8 @@ def on_catalogue(command: Command) -> Command:
             catalogue = Catalogue(settings.catalogue_url)
         except (ArgumentError, ImportError, ValueError) as error:
             raise click.ClickException(
-                f"HELIOPSF_DATABASE_URL cannot be used ({type(error).__name__}); set it to postgresql://..., or unset it"
+                f"HELIOPSF_DATABASE_URL cannot be used ({type(error).__name__}); set it to postgresql://..., or unset "
+                "it"
             ) from error
         try:
             command(settings, catalogue, **given)
@@ -108,7 +111,9 @@ def database() -> None:
 @database.command("status", short_help="Show the revision of the tables.")
 @on_catalogue
 def status(_settings: Settings, catalogue: Catalogue) -> None:
-    """Show the revision of the database and the revision that this version needs. If they differ, the exit status is 1."""
+    """Show the revision of the database and the revision that this version needs. If they differ, the exit status is
+    1.
+    """
     schema = catalogue.schema.status()
     echo(sentence(schema))
     if schema.state != "current":
@@ -120,8 +125,8 @@ def status(_settings: Settings, catalogue: Catalogue) -> None:
 def upgrade(_settings: Settings, catalogue: Catalogue) -> None:
     """Upgrade the tables to the revision of this version, as the next `heliopsf serve` would.
 
-    The command also restores missing tables and indexes. A database of SQLite is copied first, into a file beside it; of
-    PostgreSQL, make a copy yourself.
+    The command also restores missing tables and indexes. A database of SQLite is copied first, into a file beside it;
+    of PostgreSQL, make a copy yourself.
     """
     before = catalogue.schema.status()
     copy = catalogue.upgrade()
@@ -149,8 +154,9 @@ def store() -> None:
 
 @store.command("collect", short_help="Remove files that nothing refers to.")
 @click.option("--dry-run", is_flag=True, help="List the files that would be removed, but remove nothing")
-@click.option("--older-than", "older_than_s", type=DURATION, default="30d",
-              help="Remove only files older than this")  # fmt: skip
+@click.option(
+    "--older-than", "older_than_s", type=DURATION, default="30d", help="Remove only files older than this"
+)
 @click.option("--even-most", is_flag=True, help="Allow that more than half of all files are removed")
 @on_catalogue
 def collect_command(
@@ -158,8 +164,9 @@ def collect_command(
 ) -> None:
     """Remove files that no upload, PSF, product, report or job refers to. Killed processes leave such files.
 
-    Recent files are kept, because uploads and running jobs store a file before the database refers to it. If two databases
-    share one store, this command removes the files of the other database. Therefore use a store for one database only.
+    Recent files are kept, because uploads and running jobs store a file before the database refers to it. If two
+    databases share one store, this command removes the files of the other database. Therefore use a store for one
+    database only.
     """
     if older_than_s < settings.max_job_s:
         days = -(-settings.max_job_s // DAY_S)
@@ -169,7 +176,8 @@ def collect_command(
         )
     if catalogue.schema.status().state != "current":
         raise click.ClickException(
-            "the database is not at the revision of this version, so this command may not find all references to files; see "
+            "the database is not at the revision of this version, so this command may not find all references to "
+            "files; see "
             "`heliopsf database status`"
         )
     result = collect(catalogue, open_store(settings), older_than_s, dry_run=dry_run, even_most=even_most)
@@ -184,14 +192,18 @@ def collect_command(
 
 @store.command("check", short_help="Find lost and damaged files.")
 @click.option("--sizes", is_flag=True, help="Compare only the sizes of files; do not read the files")
-@click.option("--repair", "repairs", is_flag=True,
-              help="Set damaged files aside, and queue the jobs that make lost results again")  # fmt: skip
+@click.option(
+    "--repair",
+    "repairs",
+    is_flag=True,
+    help="Set damaged files aside, and queue the jobs that make lost results again",
+)
 @on_catalogue
 def check_command(settings: Settings, catalogue: Catalogue, sizes: bool, repairs: bool) -> None:
     """Compare every file of the store with its recorded SHA-256. If a file is lost or damaged, the exit status is 1.
 
-    Each line names a product, PSF, report, solution or upload with such a file. Uploads cannot be made again: their owners
-    must upload them again.
+    Each line names a product, PSF, report, solution or upload with such a file. Uploads cannot be made again: their
+    owners must upload them again.
     """
     count = 0
     files = open_store(settings)
@@ -237,8 +249,13 @@ def store_psf() -> None:
 @store_psf.command("get", short_help="Bring a published PSF and add it for all owners.")
 @NAMES
 @SOURCE
-@click.option("--owner", "owners", multiple=True, type=OWNER_NAME,
-              help="Add it for this owner; can be repeated [default: every owner with a valid key, and requests without a key]")  # fmt: skip
+@click.option(
+    "--owner",
+    "owners",
+    multiple=True,
+    type=OWNER_NAME,
+    help="Add it for this owner; can be repeated [default: every owner with a valid key, and requests without a key]",
+)
 @on_catalogue
 def store_psf_get(
     settings: Settings,
@@ -286,10 +303,19 @@ def key() -> None:
     short_help="Create a key and print it once.",
     epilog="Scopes: " + "; ".join(f"{name}: {text}" for name, text in MEANINGS.items()),
 )
-@click.option("--owner", required=True, type=OWNER_NAME,
-              help="Owner of all data that is made with this key; an owner may have several keys")  # fmt: skip
-@click.option("--scope", "scopes", multiple=True, type=click.Choice([scope.value for scope in Scope]),
-              help=f"Scope of the key; can be repeated [default: {', '.join(DEFAULT_SCOPES)}]")  # fmt: skip
+@click.option(
+    "--owner",
+    required=True,
+    type=OWNER_NAME,
+    help="Owner of all data that is made with this key; an owner may have several keys",
+)
+@click.option(
+    "--scope",
+    "scopes",
+    multiple=True,
+    type=click.Choice([scope.value for scope in Scope]),
+    help=f"Scope of the key; can be repeated [default: {', '.join(DEFAULT_SCOPES)}]",
+)
 @click.option("--expires", type=DURATION, metavar="30d", help="Lifetime [default: until it is revoked]")
 @click.option(
     "--label",

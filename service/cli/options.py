@@ -1,7 +1,7 @@
 """What commands share: options, settings, and output files.
 
-Most options are made from the fields of the requests: name, type, limits, default and help text. A command names the fields that
-it offers and passes their values on as they are. A new field therefore needs no further declaration:
+Most options are made from the fields of the requests: name, type, limits, default and help text. A command names the
+fields that it offers and passes their values on as they are. A new field therefore needs no further declaration:
 `workers.contract.requests` describes it.
 
 This file imports no numerical libraries, so that commands start fast.
@@ -139,7 +139,8 @@ def _type(kind: Any, field: FieldInfo) -> click.ParamType:
 
 
 class Text(click.ParamType):
-    """The type of an option whose text a function reads. A ``DataError`` or ValueError of the function becomes a usage error.
+    """The type of an option whose text a function reads. A ``DataError`` or ValueError of the function becomes a usage
+    error.
 
     The value of the option is what the function returns; with ``keep`` it is the text.
     """
@@ -175,7 +176,10 @@ class _Output(click.Path):
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """The path. "-" is refused: it means standard output in many programs, but commands write messages there."""
         if str(value) == "-":
-            message = "expected a name; got '-': results are not written to standard output. './-' is a file of this name"
+            message = (
+                "expected a name; got '-': results are not written to standard output. './-' is a file of this "
+                "name"
+            )
             self.fail(message, param, ctx)
         return super().convert(value, param, ctx)
 
@@ -265,7 +269,9 @@ LOCAL = "heliopsf.local"
 
 
 def kept(name: str) -> dict[str, Any]:
-    """The arguments of an option whose value goes to the context of the command, under this name, and not to the command."""
+    """The arguments of an option whose value goes to the context of the command, under this name, and not to the
+    command.
+    """
     return {
         "expose_value": False,
         "callback": lambda context, _, value: context.meta.update({name: value}),
@@ -319,8 +325,9 @@ def _check_files(parameters: Sequence[click.Parameter], given: dict[str, Any]) -
 
 
 def check_fresh_folder(folder: Path, inputs: Sequence[Path] = (), *, overwrite: bool = False) -> None:
-    """Raise ``ClickException`` if an output folder cannot be made or written, if it holds files and ``overwrite`` is false,
-    or if it holds an input."""
+    """Raise ``ClickException`` if an output folder cannot be made or written, if it holds files and ``overwrite`` is
+    false, or if it holds an input.
+    """
     if not overwrite and folder.is_dir() and any(folder.iterdir()):
         raise click.ClickException(f"{folder} is not empty; name another folder, or use --overwrite")
     for path in inputs:

@@ -1,4 +1,5 @@
-"""What a command prints: its lines, and its progress on standard error: a bar on a terminal, otherwise a line every 10 s.
+"""What a command prints: its lines, and its progress on standard error: a bar on a terminal, otherwise a line every 10
+s.
 
 Names and messages of files, services and other owners may contain characters that control a terminal. Commands print
 them by ``echo`` and ``say``, which make them harmless.
@@ -25,7 +26,7 @@ Report = Callable[[str, int, int], None]
 
 
 def printable(text: str) -> str:
-    """The text with every character that can control a terminal in the form \\x1b. Line ends and tabs stay."""
+    r"""The text with every character that can control a terminal in the form \x1b. Line ends and tabs stay."""
     return "".join(c if c in "\n\t" or unicodedata.category(c)[0] != "C" else ascii(c)[1:-1] for c in text)
 
 

@@ -32,7 +32,8 @@ from workers.contract.jobs import Queue, queues_named
 if TYPE_CHECKING:
     from service.client.http import Client
 
-# Longer than HELIOPSF_LEASE_S and HELIOPSF_RECONCILE_S together: the job of a lost worker is then found before others end.
+# Longer than HELIOPSF_LEASE_S and HELIOPSF_RECONCILE_S together: the job of a lost worker is then found before others
+# end.
 IDLE_S = 30.0
 DEMO_DATA = "data"
 DEMO_LOG = "server.log"  # a later demo recognises the folder of an earlier demo by this file
@@ -42,13 +43,17 @@ DEMO_LOG = "server.log"  # a later demo recognises the folder of an earlier demo
 @click.option("--host", default="127.0.0.1", help="Address to listen on")
 @click.option("--port", default=8765, help="Port to listen on; 0: any free port")
 @DATA
-@click.option("-v", "--verbose", is_flag=True,
-              help="Also log every request on a terminal; a log that is not on a terminal always contains every request")  # fmt: skip
+@click.option(
+    "-v",
+    "--verbose",
+    is_flag=True,
+    help="Also log every request on a terminal; a log that is not on a terminal always contains every request",
+)
 def serve(host: str, port: int, data: Path | None, verbose: bool) -> None:
     """Start a service over HTTP, and keep it running until it is interrupted.
 
-    If no broker is set (HELIOPSF_BROKER_URL), the command also starts a worker. If other machines can reach the address, every
-    request needs a key; make keys with `heliopsf key create`.
+    If no broker is set (HELIOPSF_BROKER_URL), the command also starts a worker. If other machines can reach the
+    address, every request needs a key; make keys with `heliopsf key create`.
     """
     from sqlalchemy.exc import SQLAlchemyError
 
@@ -86,7 +91,7 @@ def browser_address(url: str) -> str:
     """The address at which a browser on this machine reaches a service that listens at ``url``."""
     parts = urlsplit(url)
     # All addresses of the machine; a browser cannot open this one.
-    everywhere = parts.hostname in ("0.0.0.0", "::")
+    everywhere = parts.hostname in ("0.0.0.0", "::")  # noqa: S104  # a comparison
     return f"http://localhost:{parts.port}" if everywhere else url
 
 
@@ -97,8 +102,15 @@ def browser_address(url: str) -> str:
     type=Text(queues_named, keep=True),
     help=f"Queues to serve, separated by commas: {', '.join(Queue)} [default: all]",
 )
-@click.option("--until-idle", type=click.FloatRange(0, min_open=True), is_flag=False, flag_value=IDLE_S, metavar="[SECONDS]",
-              help=f"End with status 0 when this worker has run no job, and no job of its queues has waited, for SECONDS [without SECONDS: {IDLE_S:g}]")  # fmt: skip
+@click.option(
+    "--until-idle",
+    type=click.FloatRange(0, min_open=True),
+    is_flag=False,
+    flag_value=IDLE_S,
+    metavar="[SECONDS]",
+    help="End with status 0 when this worker has run no job, and no job of its queues has waited, for SECONDS "
+    f"[without SECONDS: {IDLE_S:g}]",
+)
 @DATA
 @click.option("--stop-with-parent", type=int, metavar="PID", hidden=True)
 def worker(
@@ -128,8 +140,7 @@ def worker(
 
 @click.command()
 @click.option("--image", type=FILE, help="Your own image (FITS) [default: a simulated image]")
-@click.option("-o", "--output", default="heliopsf-demo", type=OUTPUT_FOLDER,
-              help="Folder for the results")  # fmt: skip
+@click.option("-o", "--output", default="heliopsf-demo", type=OUTPUT_FOLDER, help="Folder for the results")
 def demo(image: Path | None, output: Path) -> None:
     """Start a service, upload an image, deconvolve it, download the product, and stop the service.
 
@@ -142,7 +153,9 @@ def demo(image: Path | None, output: Path) -> None:
 
 
 def run_demo(image: Path | None, output: Path, progress: Progress) -> list[str]:
-    """Start a service on a free port, upload and deconvolve an image, download the product, stop the service. Returns lines to print."""
+    """Start a service on a free port, upload and deconvolve an image, download the product, stop the service. Returns
+    lines to print.
+    """
     from service.client.http import Client
 
     if image is not None:
@@ -202,7 +215,8 @@ def demo_lines(
 
 def _command() -> str:
     """How to call heliopsf: by its name if the shell finds this name, otherwise by its path in the folder of Python,
-    as after ``make demo``."""
+    as after ``make demo``.
+    """
     beside = Path(sys.executable).with_name("heliopsf")
     if shutil.which("heliopsf") or not beside.exists():
         return "heliopsf"

@@ -123,11 +123,13 @@ def transit(
         raise click.ClickException(f"cannot write {output}: {error.strerror or error}") from error
     exposures = sorted({shot.exposure_s for shot in plan.shots})
     echo(
-        f"{output}: {counted(len(plan.shots), 'image')} of {plan.size_px} x {plan.size_px} px, {counted(len(plan.pointings), 'pointing')}, "
+        f"{output}: {counted(len(plan.shots), 'image')} of {plan.size_px} x {plan.size_px} px, "
+        f"{counted(len(plan.pointings), 'pointing')}, "
         f"exposure{'s' if len(exposures) > 1 else ''} of {listed([f'{t:g}' for t in exposures])} s"
     )
     echo(
-        f"scatter b {scatter.b_px:g} px, c {scatter.c:g}, total {scatter.total:g}; the file of true values is {output / 'truth.json'}"
+        f"scatter b {scatter.b_px:g} px, c {scatter.c:g}, total {scatter.total:g}; the file of true values is "
+        f"{output / 'truth.json'}"
     )
 
 

@@ -70,7 +70,9 @@ def fresnel(
     windows: int | None,
     overwrite: bool,
 ) -> None:
-    """Compare the combined diffraction of all meshes with Fresnel propagation through the telescope, in one dimension."""
+    """Compare the combined diffraction of all meshes with Fresnel propagation through the telescope, in one
+    dimension.
+    """
     from psfcore.diffraction.fresnel_study import DISTANCES_MM, fresnel_study
     from psfcore.diffraction.plots import fresnel_png
     from psfcore.instruments.model import load_instrument
@@ -86,7 +88,8 @@ def fresnel(
         write_file(plot, partial(fresnel_png, study), overwrite=overwrite)
     focus = study.focus
     echo(
-        f"best focus: mirrors {focus.separation_mm:.3f} mm apart, {focus.shift_mm:+.3f} mm from the distance in the drawing "
+        f"best focus: mirrors {focus.separation_mm:.3f} mm apart, {focus.shift_mm:+.3f} mm from the distance in the "
+        "drawing "
         f"(the drawing gives a blur of {focus.printed_blur_px:.0f} px); focal length {focus.focal_length_mm:.1f} mm"
     )
     echo("distance (mm)   largest difference, mean over phases   single phases")

@@ -1,5 +1,6 @@
-"""The commands on a transit: ``report`` tests a PSF on it; ``gap`` finds where the fitted model and the images differ and which
-effect explains the difference, measures on blind cases how often this is right, and says what a planned transit would show.
+"""The commands on a transit: ``report`` tests a PSF on it; ``gap`` finds where the fitted model and the images differ
+and which effect explains the difference, measures on blind cases how often this is right, and says what a planned
+transit would show.
 
 A command imports numerical libraries only when it is called, so that other commands start fast.
 """
@@ -39,8 +40,8 @@ from service.client.operations import Operations
 from workers.contract.requests import GapDiagnose, Report
 
 THREADS = 2  # of a plan
-# Programs for a blind set, each with a folder of images and the file of its result as further arguments. The diagnosis runs in
-# another process, which does not know the withheld effects, and imports nothing from the working folder.
+# Programs for a blind set, each with a folder of images and the file of its result as further arguments. The diagnosis
+# runs in another process, which does not know the withheld effects, and imports nothing from the working folder.
 DIAGNOSE = (
     sys.executable,
     "-P",
@@ -86,8 +87,8 @@ def report(
 ) -> None:
     """Fit a PSF to TRANSIT, or test a PSF on it: compare simulated and observed light in the occulter's disc.
 
-    TRANSIT is a folder with a transit.json, or a .zip or .tar file of such a folder. Without --psf every image is tested with
-    a PSF that was fitted to other images. Name at least one output: -o, --json or --plot.
+    TRANSIT is a folder with a transit.json, or a .zip or .tar file of such a folder. Without --psf every image is
+    tested with a PSF that was fitted to other images. Name at least one output: -o, --json or --plot.
     """
     if output is None and json_file is None and plot is None:
         raise click.UsageError(
@@ -133,7 +134,8 @@ class _DiagnosisByDefault(click.Group):
 
 @click.group(
     cls=_DiagnosisByDefault,
-    help="Find out why a fitted PSF and a transit differ. `heliopsf gap TRANSIT` is short for `heliopsf gap diagnose TRANSIT`. "
+    help="Find out why a fitted PSF and a transit differ. `heliopsf gap TRANSIT` is short for `heliopsf gap diagnose "
+    "TRANSIT`. "
     "`heliopsf gap diagnose -h` lists its options.",
     short_help="Find why a fitted PSF and a transit differ.",
 )
@@ -153,12 +155,14 @@ def gap() -> None:
     "--corrected",
     "corrected_file",
     type=OUTPUT,
-    help="Write the corrected PSF (FITS): the PSF fitted with the named effects in the model; for a tie, with the best one",
+    help="Write the corrected PSF (FITS): the PSF fitted with the named effects in the model; for a tie, with the "
+    "best one",
 )
 @click.option(
     "--effects",
     metavar="FILE.py|MODULE[,...]",
-    help="Also test the effects in these files, whose code is executed. Only with --local; in a service set HELIOPSF_GAP_EFFECTS",
+    help="Also test the effects in these files, whose code is executed. Only with --local; in a service set "
+    "HELIOPSF_GAP_EFFECTS",
 )
 @options_of(GapDiagnose, "coverage", "seed", "noise", "saturation_dn")
 @SERVER_OR_LOCAL
@@ -208,7 +212,8 @@ def diagnose(
         echo(f"next: {step}")
     if corrected_file is not None and corrected is None:
         raise click.ClickException(
-            f"{corrected_file} was not written: the diagnosis found no effect for a corrected PSF (verdict {report['verdict']})"
+            f"{corrected_file} was not written: the diagnosis found no effect for a corrected PSF (verdict "
+            f"{report['verdict']})"
         )
 
 
@@ -225,7 +230,9 @@ def _next_step(report: dict[str, Any], transit: str, page: Path | None, correcte
 
 
 def _lines(report: dict[str, Any]) -> list[str]:
-    """The answer of the report as lines to print: where, which, how far; then the verdict, what could not be tested, and cautions."""
+    """The answer of the report as lines to print: where, which, how far; then the verdict, what could not be tested,
+    and cautions.
+    """
     answer = f" ({', '.join(report['answer'])})" if report["answer"] else ""
     out = [*report["lines"], f"verdict: {report['verdict']}{answer}"]
     if report["untestable"]:
@@ -257,7 +264,8 @@ def _lines(report: dict[str, Any]) -> list[str]:
     multiple=True,
     type=click.FloatRange(0.05, 50),
     metavar="PCT",
-    help="Residual in the discs, percent, that remains when the PSF is fitted to images with the effect; repeat to vary it "
+    help="Residual in the discs, percent, that remains when the PSF is fitted to images with the effect; repeat to "
+    "vary it "
     "[default: random, 0.5 to 10]",
 )
 @click.option("--clean-only", is_flag=True, help="Make only cases without an effect, to count false alarms")
@@ -275,7 +283,8 @@ def blind(
     output: Path, processes: int, keep: bool, scenes: tuple[Path, ...], make_only: bool, **parameters: Any
 ) -> None:
     """Test the diagnosis on simulated cases whose effect is withheld from the diagnosis. To continue a stopped run,
-    repeat the command."""
+    repeat the command.
+    """
     from psfcore.blind.case_set import alone_in, make_set
     from psfcore.blind.cases import SetPlan
     from psfcore.blind.run_set import run_set
@@ -327,8 +336,8 @@ def plan(
 ) -> None:
     """Find the strength at which each effect would be found in the images of PLAN, and which effects would look alike.
 
-    PLAN is a plan (JSON), the truth.json of a simulated transit, a transit.json, or a folder with a transit.json. Its images
-    need not exist: transit.json may state size_px, and the exposure_s of each image.
+    PLAN is a plan (JSON), the truth.json of a simulated transit, a transit.json, or a folder with a transit.json. Its
+    images need not exist: transit.json may state size_px, and the exposure_s of each image.
     """
     from psfcore.gap.planning import limits_of_file
     from psfcore.gap.report.limits import lines, plan_page

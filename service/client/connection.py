@@ -1,4 +1,6 @@
-"""The connection of a client to a service: requests, lists, downloads, streams of events, and uploads of large files in parts."""
+"""The connection of a client to a service: requests, lists, downloads, streams of events, and uploads of large files in
+parts.
+"""
 
 from __future__ import annotations
 
@@ -35,8 +37,8 @@ GOES_ON = "Submitted jobs are kept and continue when the service runs again; try
 PART_BYTES = 2**24  # a cut costs at most this many bytes, because each part has its own checksum
 FROM_BYTES = 2**26  # smaller files are sent in one request
 TUS = {"Tus-Resumable": "1.0.0"}
-# Statuses after which the client asks for the offset and continues: no answer, the part was damaged (460), another request
-# sends bytes (423), or the offset was another one (409).
+# Statuses after which the client asks for the offset and continues: no answer, the part was damaged (460), another
+# request sends bytes (423), or the offset was another one (409).
 AGAIN = (*PASSING, 409, 423, 460)
 Ask = Callable[..., httpx.Response]
 _STANDARD_FIELDS = ("type", "title", "status", "detail", "instance")  # of a problem document, RFC 9457
@@ -238,7 +240,8 @@ class Connection:
 
     def _events(self, address: str, **options: Any) -> Generator[dict[str, str], None, None]:
         """The events of a stream. If the connection is lost, the stream is opened again. The iteration ends if the
-        service answers 204 (no more events)."""
+        service answers 204 (no more events).
+        """
         last_id: str | None = None
         patience = Patience(self.say, GOES_ON)
         while True:
@@ -312,7 +315,8 @@ def _check_digest(response: httpx.Response, received: bytes) -> None:
     digest = re.search(r"\bsha-256=:([A-Za-z0-9+/=]+):", declared)
     if digest is not None and digest[1] != base64.b64encode(received).decode():
         raise ServiceError(
-            f"expected a file with the SHA-256 {base64.b64decode(digest[1]).hex()}; received one with {received.hex()}: try "
+            f"expected a file with the SHA-256 {base64.b64decode(digest[1]).hex()}; received one with "
+            f"{received.hex()}: try "
             "again; if this does not help, the file in the store is damaged: tell the operator",
             code="download-damaged",
         )
@@ -347,8 +351,8 @@ def _raise_if_refused(response: httpx.Response) -> None:
 def upload_in_parts(ask: Ask, path: Path, kind: str, filename: str, say: Callable[[str], None]) -> str:
     """Upload a file; returns its address in the service. If an earlier upload of this file was cut, continue it.
 
-    ask(method, address, ...): sends a request. Raises ``ServiceError`` if the service refuses the file, or if it does not
-    answer for 10 minutes.
+    ask(method, address, ...): sends a request. Raises ``ServiceError`` if the service refuses the file, or if it does
+    not answer for 10 minutes.
     """
     length = path.stat().st_size
     metadata = {"kind": kind, "filename": filename, "sha256": sha256_of(path)}

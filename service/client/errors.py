@@ -1,5 +1,6 @@
-"""What can go wrong between a client and a service: its errors, requests without an answer, and the address of a service, as
-users write it: a URL, or host and port of this machine without a scheme."""
+"""What can go wrong between a client and a service: its errors, requests without an answer, and the address of a
+service, as users write it: a URL, or host and port of this machine without a scheme.
+"""
 
 from __future__ import annotations
 
@@ -65,8 +66,10 @@ def error_lines(message: str, fields: Mapping[str, Any], *, local: bool) -> list
     return [
         f"no PSF is known for {fields['image']}{reason}",
         "Two ways:",
-        f"  1. your own PSF: --psf FILE.fits, or an instrument file (docs/instruments.md): --psf FILE.toml{ids}{known['upload']}",
-        f"  2. a fit to images of a transit: heliopsf psf fit TRANSIT -o PSF.fits{' --local' if local else ''}{known['fit']}",
+        "  1. your own PSF: --psf FILE.fits, or an instrument file (docs/instruments.md): --psf "
+        f"FILE.toml{ids}{known['upload']}",
+        "  2. a fit to images of a transit: heliopsf psf fit TRANSIT -o "
+        f"PSF.fits{' --local' if local else ''}{known['fit']}",
     ]
 
 
@@ -114,7 +117,9 @@ class Patience:
                 return answer
 
     def wait(self, error: ServiceError, passing: Collection[int | None] = PASSING) -> None:
-        """Wait before the next try. Raises the error if its status is not in ``passing``, or if the patience is at its end."""
+        """Wait before the next try. Raises the error if its status is not in ``passing``, or if the patience is at its
+        end.
+        """
         if error.status not in passing or time.monotonic() - self._since > PATIENCE_S:
             raise error
         if not self._lost and (error.status != 429 or error.code == "too-many-streams"):
@@ -130,8 +135,8 @@ class Patience:
 def service_address(text: str) -> str:
     """The URL of a service. ``localhost:8791`` becomes ``http://localhost:8791``.
 
-    A host of another machine needs a scheme, because the client cannot know whether this machine uses TLS, and an access
-    key must not be sent without TLS by mistake. Raises ``ServiceError`` "bad-address".
+    A host of another machine needs a scheme, because the client cannot know whether this machine uses TLS, and an
+    access key must not be sent without TLS by mistake. Raises ``ServiceError`` "bad-address".
     """
     text = text.strip()
     url = text if "://" in text else f"http://{text}"
@@ -155,7 +160,8 @@ def service_address(text: str) -> str:
 
 def how_to_start(server: str) -> str:
     """What to do if no service answers at this address: the command that starts a service there, if the address is on
-    this machine."""
+    this machine.
+    """
     parts = urlsplit(server)
     if parts.scheme != "http" or not is_loopback(parts.hostname or ""):
         return "check the address, or ask the operator whether the service runs"

@@ -1,4 +1,6 @@
-"""An HTTP client for scripts: ``with Client("http://127.0.0.1:8765") as client: client.deconvolve("in.fits", "out.fits")``."""
+"""An HTTP client for scripts: ``with Client("http://127.0.0.1:8765") as client: client.deconvolve("in.fits",
+"out.fits")``.
+"""
 
 from __future__ import annotations
 

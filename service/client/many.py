@@ -63,10 +63,10 @@ def deconvolve_many(
 ) -> Iterator[Outcome]:
     """Deconvolve images into a folder, and yield the outcome for each image, in the order of the images.
 
-    At most ``service.jobs_at_once`` jobs are in flight. parameters: as for ``Operations.deconvolve``, except the pictures. If an
-    image cannot be read, deconvolved or written, its outcome has the reason, and the next image follows. overwrite: replace
-    files that have the name of a product but are not this product. progress(done, of) is called at the beginning and after
-    each image.
+    At most ``service.jobs_at_once`` jobs are in flight. parameters: as for ``Operations.deconvolve``, except the
+    pictures. If an image cannot be read, deconvolved or written, its outcome has the reason, and the next image
+    follows. overwrite: replace files that have the name of a product but are not this product. progress(done, of) is
+    called at the beginning and after each image.
 
     Raises ``ServiceError`` for an error that concerns every image: "output-not-writable", a refused key, a full
     quota, or no answer from the service. If the service answers, images whose jobs are in flight are finished before
@@ -130,7 +130,8 @@ class _Run:
 
     def _finished(self, leave: int) -> Iterator[Outcome]:
         """Finish images, oldest first, until at most ``leave`` jobs are in flight and the oldest unfinished image has
-        a job in flight."""
+        a job in flight.
+        """
         while self._pending:
             first = self._pending[0]
             if isinstance(first, _Pending):
@@ -179,7 +180,8 @@ class _Run:
 
 def _outcome(image: Path, step: Callable[[], _Step]) -> _Step | Outcome:
     """The answer of a step, or the outcome of the image if the step failed. Raises ``ServiceError`` if the error
-    concerns every image."""
+    concerns every image.
+    """
     try:
         return step()
     except ServiceError as error:
@@ -194,7 +196,8 @@ def _outcome(image: Path, step: Callable[[], _Step]) -> _Step | Outcome:
 
 def _products_in(folder: Path) -> _Products:
     """Find the files of the complete products in a folder. Return a dictionary from (product id, SHA-256 of the input
-    image) to the file."""
+    image) to the file.
+    """
     products: _Products = {}
     limits = FitsLimits(max_pixels=LARGEST_PX)
     for path in fits_in(folder):
@@ -211,5 +214,6 @@ def _products_in(folder: Path) -> _Products:
 
 def _patiently(ask: Callable[[], Answer]) -> Answer:
     """The answer to a request. The request is repeated while the service is busy or the caller's rate limit is used
-    up."""
+    up.
+    """
     return Patience(say=lambda line: None, goes_on="").repeat(ask, BUSY)

@@ -23,7 +23,8 @@ Progress = Callable[[str, int, int], None]  # called with the stage, the step, a
 class Operations(ABC):
     """The requests to a service, over HTTP or in this process. Every method raises ``ServiceError``.
 
-    server: address of the service; None: this process. jobs_at_once: number of jobs that ``service.client.many`` has in flight.
+    server: address of the service; None: this process. jobs_at_once: number of jobs that ``service.client.many`` has in
+    flight.
     """
 
     server: str | None = None
@@ -51,7 +52,8 @@ class Operations(ABC):
 
     @abstractmethod
     def upload_transit(self, path: str | Path) -> dict[str, Any]:
-        """Upload a transit: a folder, or an archive of a folder. Returns the description of the transit, with its ``id``.
+        """Upload a transit: a folder, or an archive of a folder. Returns the description of the transit, with its
+        ``id``.
 
         From a folder, transit.json and the files that it names are sent. The same folder always gives the same bytes.
         """
@@ -95,7 +97,8 @@ class Operations(ABC):
     @abstractmethod
     def submit(self, kind: str, **parameters: Any) -> dict[str, Any]:
         """Submit a job; returns its description. If an identical job was submitted before, returns the description of
-        that job."""
+        that job.
+        """
 
     @abstractmethod
     def result_id(self, kind: str, **parameters: Any) -> str:
@@ -147,7 +150,9 @@ class Operations(ABC):
 
     @abstractmethod
     def wait(self, job: dict[str, Any], *, progress: Progress | None = None) -> dict[str, Any]:
-        """Wait until a job is completed; returns its description. Raises ``ServiceError`` if the job fails or is cancelled."""
+        """Wait until a job is completed; returns its description. Raises ``ServiceError`` if the job fails or is
+        cancelled.
+        """
 
     @abstractmethod
     def get(self, address: str) -> dict[str, Any]:
@@ -455,7 +460,9 @@ class Operations(ABC):
         overwrite: bool = False,
         **parameters: Any,
     ) -> dict[str, Any]:
-        """Run a job of this kind on a transit, and download files of its result; returns the description of the result."""
+        """Run a job of this kind on a transit, and download files of its result; returns the description of the
+        result.
+        """
         check_outputs(files.values(), inputs=(transit,), overwrite=overwrite)
         transit_id = self.upload_transit(transit)["id"]
         request = {"transit_id": transit_id, **without_none(parameters), **_noise(noise)}

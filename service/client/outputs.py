@@ -23,7 +23,8 @@ def check_outputs(
 
     Codes: "output-is-input" if an output is the same file as an input, or as a file in an input folder, also through a
     symbolic or hard link; "outputs-equal" if two outputs are the same file; "output-exists" if an output exists and
-    ``overwrite`` is false; "output-not-writable" if a file cannot be written there now (a small file is written and removed).
+    ``overwrite`` is false; "output-not-writable" if a file cannot be written there now (a small file is written and
+    removed).
     """
     read = {_file(path): path for one in inputs if one is not None for path in _files_in(Path(one))}
     taken: dict[_File, Path] = {}
@@ -62,10 +63,12 @@ def check_output_folder(folder: Name) -> None:
 
 @contextmanager
 def written(output: Name, *, overwrite: bool = False) -> Iterator[Path]:
-    """A temporary path for the content of ``output``. The file replaces ``output`` if the block ends without an exception.
+    """A temporary path for the content of ``output``. The file replaces ``output`` if the block ends without an
+    exception.
 
     A name that ends in .gz gets a file in gzip. A symbolic link stays a link; the file that it leads to is replaced. A
-    device or a pipe, such as /dev/stdout, is written directly. Raises ``ServiceError`` "output-exists" if the file exists and ``overwrite`` is false.
+    device or a pipe, such as /dev/stdout, is written directly. Raises ``ServiceError`` "output-exists" if the file
+    exists and ``overwrite`` is false.
     """
     target = Path(output)
     if _is_device(target):
@@ -110,7 +113,8 @@ def _is_device(path: Path) -> bool:
 def _check_free(output: Path, overwrite: bool) -> None:
     if output.exists() and not overwrite:
         raise ServiceError(
-            f"cannot write {output}: the file exists; name another file, or replace it (--overwrite, in Python overwrite=True)",
+            f"cannot write {output}: the file exists; name another file, or replace it (--overwrite, in Python "
+            "overwrite=True)",
             code="output-exists",
         )
 

@@ -9,8 +9,8 @@ A browser adds the cookie by itself, so a page of another site could try to use 
 
 - The cookie has ``SameSite=Strict``: browsers do not send it with requests that another site causes.
 - ``service.http.guard`` refuses every change whose ``Sec-Fetch-Site`` or ``Origin`` names another site.
-- If a change by cookie has neither of the two headers, the request must contain the form token of the session, which only
-  pages of this service know: in the header ``X-Form-Token``. Pages also accept the field ``form_token`` of a form
+- If a change by cookie has neither of the two headers, the request must contain the form token of the session, which
+  only pages of this service know: in the header ``X-Form-Token``. Pages also accept the field ``form_token`` of a form
   (``service.pages.login``). All other routes, UWS included, look at headers alone and read no body for this check.
 """
 
@@ -52,7 +52,7 @@ from workers.contract.requests import SHORT_ID
 from workers.lookup import no_such
 
 ACT_FOR = "X-Owner"  # names the owner that an administrator acts for
-FORM_TOKEN = "X-Form-Token"
+FORM_TOKEN = "X-Form-Token"  # noqa: S105  # the name of a header
 # The parts of addresses that are ids: the table, the name of the thing, and the digits of a whole id.
 IDS: dict[str, tuple[type[ListedRow], str, int]] = {
     "image_id": (ImageRow, "image", 64),
@@ -70,7 +70,9 @@ BEARER, BASIC = 'Bearer realm="heliopsf"', 'Basic realm="heliopsf", charset="UTF
 
 @dataclass(frozen=True)
 class Caller:
-    """The sender of a request. ``owner`` owns everything that the request reads and makes; ``scopes`` are the scopes of the key."""
+    """The sender of a request. ``owner`` owns everything that the request reads and makes; ``scopes`` are the scopes of
+    the key.
+    """
 
     owner: str
     scopes: frozenset[Scope]
@@ -94,7 +96,8 @@ def _caller(
     _basic: Annotated[object, Depends(_AS_PASSWORD)],
 ) -> Caller:
     """The caller of a request. Raises ``Problem`` if the key lacks a scope that the route needs, or if the caller
-    reached a limit."""
+    reached a limit.
+    """
     let_in: Caller | None = getattr(request.state, "let_in", None)  # set by KeyFirst
     return let_in or admit(request, state, needed.scopes)
 
@@ -115,7 +118,8 @@ def admit(request: Request, state: State, scopes: Iterable[str], form_token: str
             raise Problem(
                 403,
                 "scope-missing",
-                f"expected a key with the scope '{scope}'; this key has {', '.join(sorted(caller.scopes))}: use another key, or ask the operator",
+                f"expected a key with the scope '{scope}'; this key has {', '.join(sorted(caller.scopes))}: use "
+                "another key, or ask the operator",
             )
         reading = scope in (Scope.READ, Scope.ADMIN)
         bucket = Bucket.READS if reading else Bucket.SUBMISSIONS
@@ -129,8 +133,8 @@ def admit(request: Request, state: State, scopes: Iterable[str], form_token: str
 def _complete_ids(request: Request, state: State, owner: str) -> None:
     """Replace each shortened id in the path of the request by the whole id: its first digits stand for an id.
 
-    Raises ``Problem`` 404 if the owner has nothing whose id begins with these digits, and 409 with the candidates if the
-    owner has several.
+    Raises ``Problem`` 404 if the owner has nothing whose id begins with these digits, and 409 with the candidates if
+    the owner has several.
     """
     path = request.scope["path_params"]
     for part, text in path.items():
@@ -153,7 +157,9 @@ def address_of(request: Request) -> str:
 
 
 def session_token(request: Request) -> str | None:
-    """The token in the cookie of the session; None without this cookie. ``service.http.guard`` let no other cookie through."""
+    """The token in the cookie of the session; None without this cookie. ``service.http.guard`` let no other cookie
+    through.
+    """
     return request.cookies.get(cookie_name(request.url.scheme))
 
 
@@ -215,8 +221,10 @@ def _check_form_token(request: Request, session: SessionRow, sent: str) -> None:
         raise Problem(
             403,
             "form-token-missing",
-            f"expected the form token of your session in the field form_token or the header {FORM_TOKEN}, because the request "
-            "does not say from which site it comes; got none or another one: load the page again, and send the form from there",
+            f"expected the form token of your session in the field form_token or the header {FORM_TOKEN}, because the "
+            "request "
+            "does not say from which site it comes; got none or another one: load the page again, and send the form "
+            "from there",
         )
 
 

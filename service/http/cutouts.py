@@ -1,4 +1,6 @@
-"""Answers that a limited process writes: a cut-out of a stored file goes into a file without a name, and then to the client."""
+"""Answers that a limited process writes: a cut-out of a stored file goes into a file without a name, and then to the
+client.
+"""
 
 from __future__ import annotations
 
@@ -28,8 +30,9 @@ async def cutout_of(
     *,
     filename: str,
 ) -> Response:
-    """The part of a stored file that ``write(path, target)`` writes, in the turn of the row's owner; or 304 if the client already
-    has it. part: a text that tells the part from the other parts of the file, and from those of other versions.
+    """The part of a stored file that ``write(path, target)`` writes, in the turn of the row's owner; or 304 if the
+    client already has it. part: a text that tells the part from the other parts of the file, and from those of other
+    versions.
 
     Raises the errors of ``write`` as a Problem.
     """

@@ -1,7 +1,8 @@
 """Files of requests and answers.
 
-A stored file, or a content made from one, is sent with an ETag, which says whether the client has it already. An upload is streamed
-to a temporary file; at the same time its bytes are hashed, counted and checked. No whole file is ever in memory.
+A stored file, or a content made from one, is sent with an ETag, which says whether the client has it already. An upload
+is streamed to a temporary file; at the same time its bytes are hashed, counted and checked. No whole file is ever in
+memory.
 """
 
 from __future__ import annotations
@@ -105,8 +106,8 @@ def json_of(store: Store, digest: str, size: int | None = None) -> dict[str, Any
 def path_of(store: Store, digest: str, size: int | None = None) -> Path:
     """The path of a stored file, after a check. Raises ``Problem`` 410 if the file is lost or damaged.
 
-    size: the recorded size of the file, bytes; the check then reads only the size. None: the check reads the whole file,
-    which must therefore be small.
+    size: the recorded size of the file, bytes; the check then reads only the size. None: the check reads the whole
+    file, which must therefore be small.
     """
     try:
         if size is not None:
@@ -165,9 +166,9 @@ OPENAPI_TRANSIT_BODY = _body("archive of the transit (.zip, .tar or .tar.gz)", "
 class Kind(Generic[Row]):
     """A kind of file that can be uploaded.
 
-    may_start: whether a file of this kind can start with these bytes; True as second argument: there are no further bytes.
-    content: reads the summary of a file, and raises DataError if the file cannot be used. row: makes the row of a file from
-    its owner, SHA-256, size, name and summary.
+    may_start: whether a file of this kind can start with these bytes; True as second argument: there are no further
+    bytes. content: reads the summary of a file, and raises DataError if the file cannot be used. row: makes the row of
+    a file from its owner, SHA-256, size, name and summary.
     """
 
     address: str
@@ -282,8 +283,8 @@ async def add_upload(
 
     Sets the status and the header Location of the response. equal: finds a row that stands for the file with this
     SHA-256; the file is then not added. columns: further arguments of ``kind.row``. Raises ``Problem`` 413 if the file
-    exceeds the size limit or the quota, 415 if it is of another kind, 400 for a broken form or an incomplete upload, and 422
-    if the content shows that the file cannot be used.
+    exceeds the size limit or the quota, 415 if it is of another kind, 400 for a broken form or an incomplete upload,
+    and 422 if the content shows that the file cannot be used.
     """
     allowed = Allowed(state, caller)
     with state.store.temporary() as path, _advising(request):
@@ -310,7 +311,8 @@ def _advising(request: Request) -> Iterator[None]:
         if error.status not in (415, 422) or media_type_of(request) != URL_ENCODED:
             raise
         advice = (
-            f"the body was sent as {URL_ENCODED}, as curl -d does, which removes zeros and line ends from a file: send it "
+            f"the body was sent as {URL_ENCODED}, as curl -d does, which removes zeros and line ends from a file: "
+            "send it "
             "with curl -F file=@FILE or curl --data-binary @FILE"
         )
         raise Problem(error.status, error.code, f"{error.detail}; {advice}", **error.more) from error
@@ -351,7 +353,9 @@ def _too_large(max_bytes: int) -> Problem:
 
 
 async def _file_of(request: Request, max_bytes: int) -> AsyncIterator[tuple[str | None, bytes]]:
-    """The pieces of the file in a request, each with the name of the file: the raw body, or the part ``file`` of a form."""
+    """The pieces of the file in a request, each with the name of the file: the raw body, or the part ``file`` of a
+    form.
+    """
     if media_type_of(request) != FORM:
         filename = request.query_params.get("filename")
         async for chunk in chunks_of(request):
@@ -368,7 +372,8 @@ async def _file_of(request: Request, max_bytes: int) -> AsyncIterator[tuple[str 
         raise Problem(
             400,
             "bad-form",
-            f"expected a form with one file, in a part named 'file'; got {len(files)} part{'s' if len(files) != 1 else ''} "
+            f"expected a form with one file, in a part named 'file'; got {len(files)} "
+            f"part{'s' if len(files) != 1 else ''} "
             "with a file: name the part 'file', and send each file in a request of its own",
         )
 

@@ -46,7 +46,8 @@ async def chunks_of(request: Request) -> AsyncIterator[bytes]:
 
 
 async def pieces_of(request: Request, most_bytes: int) -> AsyncIterator[list[Piece]]:
-    """The pieces of a form's parts in their order, one list for each chunk of the body. The first piece of a part is empty.
+    """The pieces of a form's parts in their order, one list for each chunk of the body. The first piece of a part is
+    empty.
 
     Raises ``Problem`` 400 "bad-form" if the body is no form, 400 "upload-ended-early" if the form is not complete, and
     413 if it has more than ``most_bytes`` bytes.

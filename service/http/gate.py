@@ -1,11 +1,12 @@
-"""The gate in front of work that takes long for some requests: decodings, inspections, cut-outs, headers, calls of the store.
+"""The gate in front of work that takes long for some requests: decodings, inspections, cut-outs, headers, calls of the
+store.
 
 The work runs in threads of the gate. Those of the pool, in which all other requests are answered, stay free.
 
-Each owner has a queue. A place goes to the owner who holds the fewest places; of several, to the one whose work has taken
-the least time while all of them were here. The time is measured, because what a file declares says little: 65,536 tiles in
-1.5 kB take 15 s. An owner gets a second place only if no other owner waits and one place stays free, so that the first
-request of another owner never waits for the end of a long one.
+Each owner has a queue. A place goes to the owner who holds the fewest places; of several, to the one whose work has
+taken the least time while all of them were here. The time is measured, because what a file declares says little: 65,536
+tiles in 1.5 kB take 15 s. An owner gets a second place only if no other owner waits and one place stays free, so that
+the first request of another owner never waits for the end of a long one.
 """
 
 from __future__ import annotations
@@ -27,7 +28,9 @@ Endpoint = TypeVar("Endpoint", bound=Callable[..., Any])
 
 @dataclass
 class _Queue:
-    """The requests of an owner. taken_s: the time that its work has taken, without the time of the places that it holds."""
+    """The requests of an owner. taken_s: the time that its work has taken, without the time of the places that it
+    holds.
+    """
 
     taken_s: float
     waiting: deque[anyio.Event] = field(default_factory=deque)
@@ -87,7 +90,8 @@ class Gate:
 
 
 def in_turn(register: Callable[[Callable[..., Any]], object]) -> Callable[[Endpoint], Endpoint]:
-    """Register an endpoint that calls the store, such as ``@in_turn(router.get("/{psf_id}"))``: it runs behind the gate ``stored``.
+    """Register an endpoint that calls the store, such as ``@in_turn(router.get("/{psf_id}"))``: it runs behind the gate
+    ``stored``.
 
     The endpoint has the parameters ``caller`` and ``state``. Other functions can still call it.
     """

@@ -1,18 +1,19 @@
-"""Checks every request before its route (host, origin, address, size of the body), and sets the security headers of every
-answer.
+"""Checks every request before its route (host, origin, address, size of the body), and sets the security headers of
+every answer.
 
-A header costs time before any key is known. Therefore a long Cookie header is refused, and of the others only the cookie of
-the session goes on: FastAPI parses the cookies of every request with Python's library, whose time grew with the square of
-their length before Python 3.11.10 and 3.12.6 (CVE-2024-7592).
+A header costs time before any key is known. Therefore a long Cookie header is refused, and of the others only the
+cookie of the session goes on: FastAPI parses the cookies of every request with Python's library, whose time grew with
+the square of their length before Python 3.11.10 and 3.12.6 (CVE-2024-7592).
 
 A body costs memory and time before its content is known. Therefore its size is bounded while it arrives, and the values
 in JSON are counted before Python makes objects of these values. The proxy in front of the server bounds the time.
 
-All requests are answered in rounds of one event loop, and each needs several rounds. Therefore the requests with one key begin one
-after the other, and of the bodies of one owner one piece arrives in a round: it stays short if one owner sends very much at once.
+All requests are answered in rounds of one event loop, and each needs several rounds. Therefore the requests with one
+key begin one after the other, and of the bodies of one owner one piece arrives in a round: it stays short if one owner
+sends very much at once.
 
-Every text of a request is checked by ``check_text``: those of the address and of JSON here, those of forms where the forms
-are read. The interfaces of the Virtual Observatory check theirs themselves, and answer errors in another form.
+Every text of a request is checked by ``check_text``: those of the address and of JSON here, those of forms where the
+forms are read. The interfaces of the Virtual Observatory check theirs themselves, and answer errors in another form.
 """
 
 from __future__ import annotations
@@ -42,8 +43,8 @@ SAFE_METHODS = {"GET", "HEAD", "OPTIONS"}
 # refusal needs them.
 FOR_EVERYBODY = "/static/"
 BULK = frozenset({"/v1/bulk", "/v1/bulk/estimate"})  # the only addresses at which large JSON is expected
-# Addresses that limit the size of a body themselves: UPLOADS because it may contain files, UWS_FORMS of a multipart form, so that a
-# client that sends a file is told what to do instead.
+# Addresses that limit the size of a body themselves: UPLOADS because it may contain files, UWS_FORMS of a multipart
+# form, so that a client that sends a file is told what to do instead.
 UPLOADS = re.compile(r"(/v1)?/(images|psfs|transits)|/v1/uploads/.*", re.DOTALL)
 UWS_FORMS = re.compile(r"/uws/jobs(/[^/]+/parameters)?")
 # The largest request, a bulk run of 100,000 uploaded images, has one list and one value for each image. Python makes a
@@ -105,8 +106,8 @@ class _Guard:
     async def _in_turn(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request as soon as it is the turn of its owner, or of its key if that is new here.
 
-        The turn ends when the request is admitted (``service.http.callers.admit``), reads its body, or has an answer. A request
-        without a key does not wait.
+        The turn ends when the request is admitted (``service.http.callers.admit``), reads its body, or has an answer. A
+        request without a key does not wait.
         """
         headers, state = Headers(scope=scope), scope.setdefault("state", {})
         key, turn = hash(headers.get("authorization") or headers.get("cookie")), ExitStack()
@@ -163,7 +164,8 @@ class _Guard:
             raise Problem(
                 413,
                 "too-large",
-                f"expected a request of at most {most} bytes; got more: send less in one request, or ask the operator to raise "
+                f"expected a request of at most {most} bytes; got more: send less in one request, or ask the operator "
+                "to raise "
                 f"{setting}",
             )
 
@@ -194,7 +196,8 @@ def check_text(*texts: str) -> None:
         raise Problem(
             422,
             "invalid-request",
-            "expected texts without the character NUL and without halves of surrogate pairs; got one of them: remove it",
+            "expected texts without the character NUL and without halves of surrogate pairs; got one of them: remove "
+            "it",
         )
 
 
@@ -208,7 +211,8 @@ def _check_form(path: str, headers: Headers) -> None:
 
 def _host_of(address: str) -> tuple[str | None, str]:
     """The host of an address with its port, and without it and the brackets of IPv6, in lower case; None and "" for a
-    text that is no address."""
+    text that is no address.
+    """
     try:
         parts = urlsplit(address)
         return parts.netloc.lower(), parts.hostname or ""
@@ -217,7 +221,9 @@ def _host_of(address: str) -> tuple[str | None, str]:
 
 
 def _check_origin(method: str, headers: Headers) -> None:
-    """Refuse changes that a web page of another site requests, because the browser would add its stored HTTP Basic password or cookie."""
+    """Refuse changes that a web page of another site requests, because the browser would add its stored HTTP Basic
+    password or cookie.
+    """
     if method in SAFE_METHODS:
         return
     site, origin = headers.get("sec-fetch-site"), headers.get("origin")
@@ -229,14 +235,16 @@ def _check_origin(method: str, headers: Headers) -> None:
         raise Problem(
             403,
             "cross-site",
-            "expected a request from a program or from a page of this service; got a request from a page of another site: "
+            "expected a request from a program or from a page of this service; got a request from a page of another "
+            "site: "
             "open the page of this service in the browser, and send the form there",
         )
 
 
 def _check_framing(headers: Headers) -> None:
-    """Refuse a body whose length is given in two ways: a proxy may go by the other one, and the rest of the body would then
-    be read as a further request. The connection is closed, because nobody knows where the next request begins."""
+    """Refuse a body whose length is given in two ways: a proxy may go by the other one, and the rest of the body would
+    then be read as a further request. The connection is closed, because nobody knows where the next request begins.
+    """
     if "transfer-encoding" in headers and "content-length" in headers:
         raise Problem(
             400,
@@ -257,7 +265,8 @@ def cookie_name(scheme: str) -> str:
 
 def _keep_own_cookie(scope: Scope, headers: Headers) -> None:
     """Leave only the cookie of the session in the headers of a request. Raises ``Problem`` 431 for more than
-    ``COOKIE_BYTES`` of cookies."""
+    ``COOKIE_BYTES`` of cookies.
+    """
     sent = headers.getlist("cookie")
     if not sent:
         return
@@ -266,7 +275,8 @@ def _keep_own_cookie(scope: Scope, headers: Headers) -> None:
         raise Problem(
             431,
             "cookies-too-long",
-            f"expected at most {COOKIE_BYTES} bytes of cookies; got more: delete the cookies of this site in the browser, or "
+            f"expected at most {COOKIE_BYTES} bytes of cookies; got more: delete the cookies of this site in the "
+            "browser, or "
             "send none with a key",
         )
     own = re.search(rf"(?:^|;) *({cookie_name(scope['scheme'])}=[\w-]+) *(?:;|$)", ";".join(sent), re.ASCII)
@@ -290,18 +300,22 @@ def _keep(headers: MutableHeaders, scope: Scope) -> None:
 
 
 class JsonRequest(Request):
-    """A request with JSON. Its values are counted before it is parsed; a thread parses it, so that other requests do not wait."""
+    """A request with JSON. Its values are counted before it is parsed; a thread parses it, so that other requests do
+    not wait.
+    """
 
     async def json(self) -> Any:
         """The content of the body. Raises ``Problem`` 413 for too many values, ``Problem`` 422 as ``check_text``, and
-        ValueError if it is not JSON."""
+        ValueError if it is not JSON.
+        """
         content = await self.body()
         for sign, most in MOST_OF.items():
             if content.count(sign) > most:
                 raise Problem(
                     413,
                     "too-many-values",
-                    f"expected JSON with at most {most} characters '{sign.decode()}'; got {content.count(sign)}: send less in one request",
+                    f"expected JSON with at most {most} characters '{sign.decode()}'; got {content.count(sign)}: send "
+                    "less in one request",
                 )
 
         def parsed() -> Any:

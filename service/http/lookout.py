@@ -1,8 +1,9 @@
 """One look at the database for all streams of events of an owner, every ``LOOK_EVERY_S`` seconds.
 
-Each stream is a follower, which remembers the version of each job and bulk run that it told last. Its first look is its own: it
-brings what the client does not know yet. From then on the lookout of the owner looks for all followers together. First looks and
-common ones come one after the other, so no change falls between them: what a first look did not see, the next common look tells.
+Each stream is a follower, which remembers the version of each job and bulk run that it told last. Its first look is its
+own: it brings what the client does not know yet. From then on the lookout of the owner looks for all followers
+together. First looks and common ones come one after the other, so no change falls between them: what a first look did
+not see, the next common look tells.
 """
 
 from __future__ import annotations
@@ -60,8 +61,10 @@ def version(changed_at: float) -> str:
 
 @dataclass(frozen=True)
 class Sight:
-    """What a look has seen. after: for each kind, the row after which the next look goes on. changed: what the streams of the whole
-    owner tell. versions: of these and of all that a follower knows, if they exist. states: of those that a follower does not know."""
+    """What a look has seen. after: for each kind, the row after which the next look goes on. changed: what the streams
+    of the whole owner tell. versions: of these and of all that a follower knows, if they exist. states: of those that a
+    follower does not know.
+    """
 
     after: Sequence[Moment]
     changed: Collection[Key]
@@ -70,13 +73,13 @@ class Sight:
 
 
 class Follower:
-    """A stream of the events of one job or bulk run, until it reaches its final state or is deleted, as the lookout of its owner
-    sees it.
+    """A stream of the events of one job or bulk run, until it reaches its final state or is deleted, as the lookout of
+    its owner sees it.
 
-    caller: whose key must stay valid. known: the versions that the client knows; "": none yet; None: the deletion. whole: whether the
-    stream follows all jobs and bulk runs of the owner, or only those in ``known``. after: as in ``Sight``; None: the last seconds.
-    begun: whether it has looked. joined: whether its own looks have ended, so that the lookout looks for it too. said: the texts that
-    the client has not got yet.
+    caller: whose key must stay valid. known: the versions that the client knows; "": none yet; None: the deletion.
+    whole: whether the stream follows all jobs and bulk runs of the owner, or only those in ``known``. after: as in
+    ``Sight``; None: the last seconds. begun: whether it has looked. joined: whether its own looks have ended, so that
+    the lookout looks for it too. said: the texts that the client has not got yet.
     """
 
     whole = False
@@ -94,7 +97,9 @@ class Follower:
         return [key for key in followed if versions.get(key) != self.known.get(key)]
 
     def say(self, sight: Sight) -> Said:
-        """The events for what the client does not know; afterwards the client knows it. The id of an event is a version."""
+        """The events for what the client does not know; afterwards the client knows it. The id of an event is a
+        version.
+        """
         for key in self.news(sight.versions, ()):
             state = sight.states.get(key)
             if state is None:
@@ -105,7 +110,9 @@ class Follower:
         return "", False
 
     def tell(self, said: Said) -> None:
-        """Pass a text to the stream, or its end if the client is too slow. A look without news only wakes the stream."""
+        """Pass a text to the stream, or its end if the client is too slow. A look without news only wakes the
+        stream.
+        """
         if self.said.full():
             while not self.said.empty():
                 self.said.get_nowait()
@@ -126,8 +133,8 @@ class OwnerFollower(Follower):
     def say(self, sight: Sight) -> Said:
         """The events, those for the named first.
 
-        Only the last event has an id: a time before which the client knows all changes. So a client that received only some of the
-        events asks for all of them again. The first look sends the id also without an event.
+        Only the last event has an id: a time before which the client knows all changes. So a client that received only
+        some of the events asks for all of them again. The first look sends the id also without an event.
         """
         news = sorted(self.news(sight.versions, sight.changed), key=lambda key: key not in self.named)
         events = [

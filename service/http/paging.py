@@ -29,7 +29,8 @@ Cursor = Annotated[str | None, Query(description="the cursor in `next` of the pr
 
 
 def place(cursor: str | None, *kinds: Callable[[str], Any]) -> tuple[Any, ...] | None:
-    """The parts of a cursor, each read by one of ``kinds`` (``finite``, ``position``, ``identity``); None without a cursor.
+    """The parts of a cursor, each read by one of ``kinds`` (``finite``, ``position``, ``identity``); None without a
+    cursor.
 
     Raises ``Problem`` 422 if this service did not issue the cursor.
     """
@@ -83,7 +84,8 @@ class Listing:
     @property
     def query(self) -> dict[str, Any]:
         """Arguments of the query for the rows: one more than the page has, which shows that there is a next page, after
-        the (created_at, id) in the cursor. Raises ``Problem`` 422 if this service did not issue the cursor."""
+        the (created_at, id) in the cursor. Raises ``Problem`` 422 if this service did not issue the cursor.
+        """
         return {"limit": self.limit + 1, "after": place(self.cursor, finite, identity)}
 
     def following(

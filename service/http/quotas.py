@@ -57,7 +57,9 @@ class Allowed:
 
 
 def check_length(state: State, caller: Caller, count: int) -> None:
-    """Raise ``Problem`` 413 if a file of this many bytes exceeds the owner's quota, and 507 if the disk has no room for it."""
+    """Raise ``Problem`` 413 if a file of this many bytes exceeds the owner's quota, and 507 if the disk has no room for
+    it.
+    """
     _check_file(state, _limited(state, caller.owner), count)
 
 
@@ -69,7 +71,8 @@ def _check_file(state: State, usage: Usage | None, count: int) -> None:
 
 def check_disk(state: State, more_bytes: int = 0) -> None:
     """Raise ``Problem`` 507 if, after ``more_bytes`` more bytes, the data folder's disk would have less free space
-    than the setting requires."""
+    than the setting requires.
+    """
     free = checks.free_bytes(state.settings.data_dir)
     least = state.settings.min_free_mib * MIB
     if free - more_bytes < least:

@@ -1,5 +1,5 @@
-"""Limits for each caller: reads, submissions and uploaded bytes per minute, and requests and streams that are open at the
-same time. A caller is an owner with all keys of this owner, or an address if the service needs no key.
+"""Limits for each caller: reads, submissions and uploaded bytes per minute, and requests and streams that are open at
+the same time. A caller is an owner with all keys of this owner, or an address if the service needs no key.
 
 If the broker is Redis, all servers count together in Redis; otherwise each process counts alone. Each caller has
 an allowance of its own, so that a runaway script does not delay the others.
@@ -81,10 +81,11 @@ class Rates:
         self._away_until = 0.0
 
     def take(self, bucket: Bucket, who: str, cost: int = 1) -> Allowance | None:
-        """Subtract a cost from a caller's allowance; returns None if there is no limit. Raises ``Problem`` 429 if the allowance is
-        used up.
+        """Subtract a cost from a caller's allowance; returns None if there is no limit. Raises ``Problem`` 429 if the
+        allowance is used up.
 
-        A request that costs more than the allowance of a minute uses the whole allowance. Otherwise it would never be accepted.
+        A request that costs more than the allowance of a minute uses the whole allowance. Otherwise it would never be
+        accepted.
         """
         item = self._items.get(bucket)
         if item is None or time.monotonic() < self._away_until:
@@ -131,13 +132,15 @@ class AtOnce:
 
     def open(self, who: str) -> None:
         """Count a further request or stream of a caller. Raises ``Problem`` 429 if the caller already has ``most``
-        open."""
+        open.
+        """
         with self._lock:
             if self._open[who] >= self._most:
                 raise Problem(
                     429,
                     self._code,
-                    f"expected at most {self._most} {self._what} of one caller at the same time; got one more: wait until "
+                    f"expected at most {self._most} {self._what} of one caller at the same time; got one more: wait "
+                    "until "
                     "one of them has ended",
                     headers={"Retry-After": "1"},
                 )

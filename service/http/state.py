@@ -57,7 +57,8 @@ class Access:
 
 def check_can_serve(settings: Settings, host: str, catalogue: Catalogue) -> None:
     """Before a server listens, check that somebody can use the server. Raises ``NoKeyYet`` if the server needs keys
-    by default and no key exists."""
+    by default and no key exists.
+    """
     access = Access.of(settings, host)
     if not access.keys:
         if not is_loopback(host):
@@ -75,7 +76,8 @@ def check_can_serve(settings: Settings, host: str, catalogue: Catalogue) -> None
     raise NoKeyYet(
         f"{host} can be reached from other machines, so every request needs a key, and no key exists yet. Make a key:\n"
         f"  {how}\n"
-        "To work without keys, serve on 127.0.0.1 (only this machine), or set HELIOPSF_ACCESS=open (everybody has access)."
+        "To work without keys, serve on 127.0.0.1 (only this machine), or set HELIOPSF_ACCESS=open (everybody has "
+        "access)."
     )
 
 

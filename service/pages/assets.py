@@ -3,9 +3,9 @@
 VERSION is a hash of all files. Scripts import each other by relative addresses, so a page and its scripts always have
 the same version, and browsers may keep them for ever.
 
-The interactive reference of the API at ``/docs`` is Swagger UI. The package ``fastapi-swagger`` contains its script and its
-style sheet. The page of that package starts Swagger UI with an inline script, which our content security policy forbids; our
-page starts it with a script file.
+The interactive reference of the API at ``/docs`` is Swagger UI. The package ``fastapi-swagger`` contains its script and
+its style sheet. The page of that package starts Swagger UI with an inline script, which our content security policy
+forbids; our page starts it with a script file.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""The pages of bulk runs: list, start and check of a run, its progress, its results as a contact sheet, and its failed images."""
+"""The pages of bulk runs: list, start and check of a run, its progress, its results as a contact sheet, and its failed
+images.
+"""
 
 from __future__ import annotations
 
@@ -107,8 +109,9 @@ def start(response: Response, caller: PageBulk, state: Shared, form: SentForm) -
 def folder_run(
     request: Request, response: Response, caller: PageBulk, state: Shared, form: SentForm
 ) -> Response:
-    """Start the run of files in a folder, and show it; or only show what it would do, and the form again. If the form is
-    refused, it is shown again with the reason."""
+    """Start the run of files in a folder, and show it; or only show what it would do, and the form again. If the form
+    is refused, it is shown again with the reason.
+    """
     estimate, problem = None, None
     try:
         run = _folder_run(form)
@@ -188,7 +191,9 @@ def bulk(
     order: Order = "worst",
     cursor: Annotated[str | None, Query(max_length=200)] = None,
 ) -> Response:
-    """The progress of a run, the reasons of its failures, and a page of its results. A script keeps the progress up to date."""
+    """The progress of a run, the reasons of its failures, and a page of its results. A script keeps the progress up to
+    date.
+    """
     view = get_bulk(bulk_id, caller, state)
     progress = state.catalogue.bulks.progress
     after = place(cursor, finite, position)

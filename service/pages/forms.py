@@ -1,4 +1,6 @@
-"""Forms: their fields become the parameters of a request, by the names, types and limits of the request's own fields."""
+"""Forms: their fields become the parameters of a request, by the names, types and limits of the request's own
+fields.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,8 @@ async def _sent_form(request: Request) -> Sent:
     return form
 
 
-# The fields of the form of a request. It follows the caller in the parameters of a route, so that nothing is read for strangers.
+# The fields of the form of a request. It follows the caller in the parameters of a route, so that nothing is read for
+# strangers.
 SentForm = Annotated[Any, Depends(_sent_form)]
 # The options of a deconvolution in the form and in the address of the page of an image.
 _OPTIONS = ("psf_id", "method", "steps", "error_draws", "photon_gain_dn", "read_noise_dn")
@@ -86,8 +89,8 @@ def number_field(kind: str, name: str) -> Markup:
 def checked(model: Callable[..., Checked], values: Mapping[str, object], *, above: int = 0) -> Checked:
     """The model with these values; or what a function returns for them.
 
-    above: how many names to remove from the start of each field's path (``loc``), because they are levels of the model and
-    not fields of the form. Raises ``Problem`` 422, which names each wrong field.
+    above: how many names to remove from the start of each field's path (``loc``), because they are levels of the model
+    and not fields of the form. Raises ``Problem`` 422, which names each wrong field.
     """
     try:
         return cast("Checked", _adapter(model).validate_python(dict(values)))

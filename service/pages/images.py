@@ -1,5 +1,7 @@
-"""The first page, where an image is dropped; and the page of an image: its header, its PSF, the estimate, and the start of its
-deconvolution; and the page of a product: the viewer, what the deconvolution changed, and how the product was made."""
+"""The first page, where an image is dropped; and the page of an image: its header, its PSF, the estimate, and the start
+of its deconvolution; and the page of a product: the viewer, what the deconvolution changed, and how the product was
+made.
+"""
 
 from __future__ import annotations
 
@@ -61,7 +63,8 @@ TO_ALLOW = ("channel-mismatch", "already-deconvolved", "psf-as-image")
 SURE = "If you are sure, allow it below."
 # Swagger UI loads its icons from data: addresses in its style sheet, and its scripts set styles.
 REFERENCE_HEADERS = {
-    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:; "
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src "
+    "'self' data:; "
     "connect-src 'self'; frame-ancestors 'none'; base-uri 'none'",
     "Referrer-Policy": "no-referrer",
 }
@@ -187,8 +190,9 @@ def _psfs(chosen: str, image: ImageRow, caller: Caller, state: State) -> tuple[l
 
 
 def _checked(image_id: str, asked: Sent, caller: Caller, state: State) -> dict[str, Any]:
-    """The check of the options. good: whether the job can start. lines: sentences, the most important first. button: its
-    text. code: of the problem; empty if there is none."""
+    """The check of the options. good: whether the job can start. lines: sentences, the most important first. button:
+    its text. code: of the problem; empty if there is none.
+    """
     try:
         found = estimate_job(deconvolution(image_id, asked), caller, state)
     except Problem as problem:
@@ -296,6 +300,8 @@ def _lost(state: State, digest: str, size: int) -> str | None:
 
 
 def _again(row: ProductRow, *, psf_id: str | None = None) -> str:
-    """The page of the image, with the options of the product. psf_id: another PSF; empty: the one that the service chooses."""
+    """The page of the image, with the options of the product. psf_id: another PSF; empty: the one that the service
+    chooses.
+    """
     other = {} if psf_id is None else {"psf_id": psf_id, "picked_for": None, "psf_recipe": None}
     return address_of({**row.details["parameters"], **other})

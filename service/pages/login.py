@@ -58,8 +58,9 @@ def install(app: FastAPI) -> None:
             return RedirectResponse("/login", 303)
         here = f"{request.url.path}?{request.url.query}" if request.url.query else request.url.path
         login = f"/login?{urlencode({'next': here})}"
-        # A person followed a link on another site. The browser then withholds the cookie, because it is SameSite=Strict.
-        # Therefore the answer is a page that opens the login page: a second request, which has the cookie.
+        # A person followed a link on another site. The browser then withholds the cookie, because it is
+        # SameSite=Strict. Therefore the answer is a page that opens the login page: a second request, which has the
+        # cookie.
         if request.headers.get("sec-fetch-site") == "cross-site":
             return page(request, "login.html", arriving=f"{login}&arrived=true")
         return RedirectResponse(login, 303)
@@ -123,7 +124,8 @@ def log_in(
     next_address: Annotated[str, Form(alias="next")] = "",
 ) -> Response:
     """Begin a session, and go to the requested page. Every refused key counts against the rate limit of the client's
-    address."""
+    address.
+    """
     if not state.access.keys:
         return RedirectResponse(local_address(next_address), 303)
     try:
@@ -153,7 +155,8 @@ def log_out(request: Request, _caller: PageVisiting, state: Shared) -> Response:
 
 def local_address(sent: str) -> str:
     """The address of a page of this service; "/" if the text could lead a browser to another site, or to the login
-    page."""
+    page.
+    """
     elsewhere = not sent.startswith("/") or sent.startswith("//") or "\\" in sent
     if elsewhere or not sent.isprintable() or len(sent) > LONGEST_ADDRESS:
         return "/"

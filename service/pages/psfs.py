@@ -1,4 +1,6 @@
-"""The pages of PSFs: the list with its forms; one PSF with its facts, curves, provenance and status; and two PSFs compared."""
+"""The pages of PSFs: the list with its forms; one PSF with its facts, curves, provenance and status; and two PSFs
+compared.
+"""
 
 from __future__ import annotations
 
@@ -85,7 +87,9 @@ async def upload(
     kind: KindOfUpload = None,
     image: Annotated[Identity | None, Query()] = None,
 ) -> Response:
-    """Take a PSF from the form, and go to its page, or to the page of the image for which it was sent. kind: as for the API."""
+    """Take a PSF from the form, and go to its page, or to the page of the image for which it was sent. kind: as for the
+    API.
+    """
     view = await upload_psf(request, response, caller, state, kind=kind)
     return RedirectResponse(f"/psfs/{view.id}" if image is None else f"/images/{image}?psf_id={view.id}", 303)
 
@@ -168,7 +172,8 @@ def change_interpolation(psf_id: Identity, caller: PageCertifying, state: Shared
         raise Problem(
             409,
             "no-series",
-            "expected a PSF of a series; the instrument of this PSF is unknown: upload the PSF again with its instrument",
+            "expected a PSF of a series; the instrument of this PSF is unknown: upload the PSF again with its "
+            "instrument",
         )
     instrument, channel, kind = series.split("/")
     change_series(instrument, channel, kind, body, caller, state)
@@ -242,7 +247,9 @@ def _unless(code: str, get: Callable[..., Thing], *args: object) -> tuple[Thing 
 
 
 def _series(state: State, caller: Caller, name: str | None) -> SeriesView | None:
-    """The series of total PSFs with this name; None if there is no such series, or if none of its PSFs was certified."""
+    """The series of total PSFs with this name; None if there is no such series, or if none of its PSFs was
+    certified.
+    """
     if name is None or not name.endswith(f"/{TOTAL}"):
         return None
     return _unless("no-such-series", get_series, *name.split("/"), caller, state)[0]
@@ -306,7 +313,9 @@ def comparison(
 
 
 def _compared(one: lookup.Tables, other: lookup.Tables) -> dict[str, Any]:
-    """The curves of two PSFs at the radii that both have, and their differences. Raises DataError "plate-scale-mismatch"."""
+    """The curves of two PSFs at the radii that both have, and their differences. Raises DataError
+    "plate-scale-mismatch".
+    """
     figures, both = lookup.compare(one, other), (one, other)
     profiles = [lookup.profile(tables) for tables in both]
     means = [profile["mean_weight"][lookup.TOTAL] for profile in profiles]

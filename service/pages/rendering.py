@@ -3,7 +3,8 @@
 A page may load scripts and styles from this service alone, and no script may turn text into markup
 (``require-trusted-types-for``). Therefore templates hold no inline scripts or styles, and scripts build elements.
 
-A file in ``templates`` has the templates of one subject, one after the other. A line ``{# --- NAME --- #}`` begins each of them.
+A file in ``templates`` has the templates of one subject, one after the other. A line ``{# --- NAME --- #}`` begins each
+of them.
 """
 
 from __future__ import annotations
@@ -94,7 +95,9 @@ def page(
 
 
 def templates() -> dict[str, str]:
-    """The sources of all templates, by their names. A file holds those of one subject; the line {# --- NAME --- #} begins each."""
+    """The sources of all templates, by their names. A file holds those of one subject; the line {# --- NAME --- #}
+    begins each.
+    """
     found: dict[str, str] = {}
     for file in files(__package__).joinpath("templates").iterdir():
         before, *parts = re.split(r"^\{# --- (\S+) --- #\}\n", file.read_text("utf-8"), flags=re.MULTILINE)
@@ -191,7 +194,9 @@ def percent(value: float | None) -> str:
 
 
 def dense(radii: Sequence[float]) -> list[int]:
-    """The places of the radii that a table shows: all near the centre; farther out, radii in ratios of at least ``RATIO``."""
+    """The places of the radii that a table shows: all near the centre; farther out, radii in ratios of at least
+    ``RATIO``.
+    """
     chosen: list[int] = []
     for place, radius in enumerate(radii):
         last = place in (0, len(radii) - 1)

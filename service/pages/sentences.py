@@ -39,7 +39,10 @@ def of_error(code: str, message: str, fields: Mapping[str, Any] = _NO_FIELDS) ->
     """The sentence for an error. fields: the fields of its ``DataError``; empty for the stored error of a job."""
     thing = NAMES.get(code.removeprefix("no-such-"))
     if thing is not None and message.startswith("expected the id"):
-        return f"There is no such {thing} here. It was deleted, or it belongs to another owner, or its address is not complete."
+        return (
+            f"There is no such {thing} here. It was deleted, or it belongs to another owner, or its address is "
+            "not complete."
+        )
     try:
         return _SENTENCES[code](message, fields)
     except KeyError:  # another code, or an error without its fields
@@ -99,7 +102,8 @@ _SENTENCES: dict[str, Callable[[str, Mapping[str, Any]], str]] = {
         "The photon gain and the read noise of this camera are not known here. Enter both in the options."
     ),
     "already-deconvolved": lambda *_: (
-        "This file is a product of heliopsf: it was deconvolved before (its header has the card PSFID). Use the original image."
+        "This file is a product of heliopsf: it was deconvolved before (its header has the card PSFID). Use the "
+        "original image."
     ),
     "psf-as-image": lambda *_: (
         "This file is a PSF and not an image (the card PSFSUM in its header). Use it as the PSF of an image."

@@ -1,5 +1,6 @@
 """The pages of transits: their list, their upload, one transit, and the jobs that use it; and the page of a report: the
-sentence, the sections and figures that the job has written, and tables and curves of its numbers."""
+sentence, the sections and figures that the job has written, and tables and curves of its numbers.
+"""
 
 from __future__ import annotations
 
@@ -107,7 +108,9 @@ def start(transit_id: Identity, kind: str, caller: PageSubmitting, state: Shared
 
 @in_turn(reports.get(""))
 def report(report_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
-    """The report. It has the same sections as the HTML page that can be downloaded, if this version or a later one made it."""
+    """The report. It has the same sections as the HTML page that can be downloaded, if this version or a later one made
+    it.
+    """
     row = state.row(ReportRow, report_id, caller.owner)
     digest = row.details.get("page_texts_sha256")
     texts = {} if digest is None else json_of(state.store, digest)
@@ -120,7 +123,7 @@ def report(report_id: Identity, request: Request, caller: PageReading, state: Sh
         title=texts.get("title") or TITLES.get(row.kind, row.kind),
         sentence=texts.get("lead") or row.details.get("sentence", ""),
         # The job has escaped all other texts of the sections.
-        sections=[Markup(one.replace('src="figure:', figures_at)) for one in texts.get("sections", [])],
+        sections=[Markup(one.replace('src="figure:', figures_at)) for one in texts.get("sections", [])],  # noqa: S704
         footer=texts.get("footer", ""),
     )
 

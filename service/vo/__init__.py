@@ -1,1 +1,3 @@
-"""The interfaces of the Virtual Observatory besides UWS: VOSI, DataLink, cut-outs, and lists with the columns of ObsCore."""
+"""The interfaces of the Virtual Observatory besides UWS: VOSI, DataLink, cut-outs, and lists with the columns of
+ObsCore.
+"""

@@ -1,7 +1,7 @@
 """The interfaces that every VO service has: ``/vo/availability``, ``/vo/capabilities`` and ``/vo/tables``.
 
-Citation: IVOA VOSI 1.1 (24 May 2017). The documents are made by ``vo-models``. They need no key, and they contain no data of
-owners: a registry or a client reads them before it knows how to log in.
+Citation: IVOA VOSI 1.1 (24 May 2017). The documents are made by ``vo-models``. They need no key, and they contain no
+data of owners: a registry or a client reads them before it knows how to log in.
 """
 
 from __future__ import annotations
@@ -27,7 +27,9 @@ router = APIRouter(prefix="/vo", tags=["VO"])
 
 @dataclass(frozen=True)
 class Offered:
-    """An interface of the service. use: "full" for a complete address, "base" for one to which a client adds parameters or names."""
+    """An interface of the service. use: "full" for a complete address, "base" for one to which a client adds parameters
+    or names.
+    """
 
     standard_id: str
     path: str
@@ -37,15 +39,27 @@ class Offered:
 
 
 OFFERED = (
-    Offered("ivo://ivoa.net/std/VOSI#availability", "/vo/availability", "Whether the service is available.", needs_key=False),
+    Offered(
+        "ivo://ivoa.net/std/VOSI#availability",
+        "/vo/availability",
+        "Whether the service is available.",
+        needs_key=False,
+    ),
     Offered("ivo://ivoa.net/std/VOSI#capabilities", "/vo/capabilities", "This document.", needs_key=False),
     Offered("ivo://ivoa.net/std/VOSI#tables-1.1", "/vo/tables", "The columns of the lists.", needs_key=False),
-    Offered("ivo://ivoa.net/std/UWS#rest-1.1", jobs.router.prefix, "All jobs: deconvolve images, build and fit PSFs, ...", "base"),
+    Offered(
+        "ivo://ivoa.net/std/UWS#rest-1.1",
+        jobs.router.prefix,
+        "All jobs: deconvolve images, build and fit PSFs, ...",
+        "base",
+    ),
     Offered(LINKS_STANDARD, "/vo/links", "The files and services that belong to a product or PSF.", "base"),
-    Offered("urn:heliopsf:products", "/vo/products", "The list of products, with columns of ObsCore.", "base"),
+    Offered(
+        "urn:heliopsf:products", "/vo/products", "The list of products, with columns of ObsCore.", "base"
+    ),
     Offered("urn:heliopsf:psfs", "/vo/psfs", "The list of PSFs, with columns of ObsCore.", "base"),
     Offered("urn:heliopsf:cutout", "/vo/cutout", "Cut a circle, box or polygon out of a product.", "base"),
-)  # fmt: skip
+)
 
 
 def _document(what: str) -> dict[str, Any]:
@@ -57,7 +71,9 @@ def _document(what: str) -> dict[str, Any]:
 
 @router.get("/availability", summary="VOSI: is the service available?", **_document("the availability"))
 async def get_availability(request: Request) -> Response:
-    """Whether database, storage, and broker or embedded worker answer, and workers take the jobs; a note for each part that does not."""
+    """Whether database, storage, and broker or embedded worker answer, and workers take the jobs; a note for each part
+    that does not.
+    """
     from vo_models.vosi.availability import Availability  # half a second, and only this request needs it
 
     state = state_of(request)

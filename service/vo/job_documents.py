@@ -1,8 +1,8 @@
 """Writes UWS 1.1 documents (job list, job, parameters, results) as XML of the IVOA schema.
 
-Citation: REC-UWS-1.1 (24 October 2016), appendix B, which also defines the order of elements. Times are UTC and end in Z.
-The models of ``vo-models`` write no element for a time that is not known, and need a class for each set of parameters;
-the schema demands these elements, and the parameters differ from kind to kind.
+Citation: REC-UWS-1.1 (24 October 2016), appendix B, which also defines the order of elements. Times are UTC and end in
+Z. The models of ``vo-models`` write no element for a time that is not known, and need a class for each set of
+parameters; the schema demands these elements, and the parameters differ from kind to kind.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Checks the parameters of jobs that UWS clients send. Each is a text in a form, and is checked against the contract.
 
-An input of a job is named by the id that it has since its upload: a form contains no file, and the standard parameter UPLOAD
-(IVOA DALI 1.1) is refused.
+An input of a job is named by the id that it has since its upload: a form contains no file, and the standard parameter
+UPLOAD (IVOA DALI 1.1) is refused.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ def resolved(
 ) -> tuple[dict[str, Any], str, dict[str, Any]]:
     """Resolved parameters of a job, the identity of its result, and its estimate.
 
-    Raises ``Problem`` 400 if the parameters are wrong or the job would exceed the limits on memory or time, and 507 if the
-    owner's quota is full.
+    Raises ``Problem`` 400 if the parameters are wrong or the job would exceed the limits on memory or time, and 507 if
+    the owner's quota is full.
     """
     check_room(state, owner)
     values, errors = _understood(kind, given)
@@ -95,10 +95,11 @@ def _wrong(kind: str, errors: Iterable[ErrorDetails]) -> Problem:
     for error, message in explained(errors, _model(kind)):
         name = "/".join(map(str, error["loc"])) or kind
         if error["type"] == "missing":
-            message = "expected a value, got none"
-        elif error["type"] not in ("extra_forbidden", "union_tag_invalid"):
-            message = f"{message}; got {shown(error['input'])}"
-        lines.append(f"{name}: {message}")
+            lines.append(f"{name}: expected a value, got none")
+        elif error["type"] in ("extra_forbidden", "union_tag_invalid"):
+            lines.append(f"{name}: {message}")
+        else:
+            lines.append(f"{name}: {message}; got {shown(error['input'])}")
     return bad("\n".join(lines))
 
 

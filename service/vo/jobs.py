@@ -127,7 +127,9 @@ def list_uws_jobs(request: Request, caller: Reading, state: Shared) -> Response:
     ),
 )
 def create_uws_job(caller: Submitting, form: Form, request: Request, state: Shared) -> Response:
-    """Create a job. All other fields are parameters of the job; write objects as JSON, and inputs by the ids of their uploads."""
+    """Create a job. All other fields are parameters of the job; write objects as JSON, and inputs by the ids of their
+    uploads.
+    """
     run_id, start = form.pop("runid", None), form.pop("phase", None)
     duration, destruction = form.pop("executionduration", None), form.pop("destruction", None)
     kind = kind_of(form)
@@ -182,7 +184,8 @@ async def get_uws_job(job_id: str, request: Request, caller: Reading, state: Sha
 @router.delete("/{job_id}", summary="UWS: abort and destroy a job", **TO_JOB)
 def delete_uws_job(row: OwnJob, request: Request, state: Shared) -> Response:
     """Delete the job in any phase. If a worker runs the job, the worker stops it. The result of the job stays in the
-    catalogue."""
+    catalogue.
+    """
     state.catalogue.uws.destroy(row.id)
     return RedirectResponse(_jobs_url(request), 303)
 
@@ -264,7 +267,9 @@ def get_uws_owner(row: Job) -> Response:
 
 @router.get("/{job_id}/parameters", summary="UWS: a job's parameters", **XML)
 def get_uws_parameters(row: Job) -> Response:
-    """While the job is PENDING, the parameters as the client sent them. After its start, the parameters with every default filled in."""
+    """While the job is PENDING, the parameters as the client sent them. After its start, the parameters with every
+    default filled in.
+    """
     return _xml(documents.parameters(row))
 
 

@@ -1,12 +1,12 @@
-"""The files and services that belong to a product or PSF, as a DataLink table, ``/vo/links``; and cut-outs of products as FITS,
-``/vo/cutout``.
+"""The files and services that belong to a product or PSF, as a DataLink table, ``/vo/links``; and cut-outs of products
+as FITS, ``/vo/cutout``.
 
-Citation: IVOA DataLink 1.1 (15 December 2023). Each ID gives the rows of its links. If an ID is not known, its only row says so,
-and the other IDs are answered. A request without an ID gets an empty table. The table also describes the cut-out
-service, so that a client can show a form for it.
+Citation: IVOA DataLink 1.1 (15 December 2023). Each ID gives the rows of its links. If an ID is not known, its only row
+says so, and the other IDs are answered. A request without an ID gets an empty table. The table also describes the
+cut-out service, so that a client can show a form for it.
 
-The parameters of a cut-out are those of IVOA SODA 1.0 (17 May 2017), but a position is in pixels or helioprojective, because the
-Sun moves in the equatorial coordinates that SODA demands; so the service does not claim to be SODA.
+The parameters of a cut-out are those of IVOA SODA 1.0 (17 May 2017), but a position is in pixels or helioprojective,
+because the Sun moves in the equatorial coordinates that SODA demands; so the service does not claim to be SODA.
 """
 
 from __future__ import annotations
@@ -220,8 +220,9 @@ def _fault(name: str | None, message: str, semantics: str = "#this", local: str 
 )  # fmt: skip
 @cutouts.post("/cutout", include_in_schema=False)
 async def get_region(request: Request, caller: Reading, state: Shared, fields: Fields) -> Response:
-    """The smallest rectangle of whole pixels that contains the region, of the image and of its planes. Give one of CIRCLE, BOX and
-    POLYGON."""
+    """The smallest rectangle of whole pixels that contains the region, of the image and of its planes. Give one of
+    CIRCLE, BOX and POLYGON.
+    """
     names = fields.get("id", [])
     if len(names) != 1:
         refuse("ID", "of one product", f"{len(names)} of them" if names else None)

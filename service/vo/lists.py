@@ -1,8 +1,8 @@
 """Lists of products and PSFs with the columns of ObsCore, as VOTable or JSON: ``/vo/products`` and ``/vo/psfs``.
 
-The name of a product or PSF for VO clients is ``urn:heliopsf:product:ID`` or ``urn:heliopsf:psf:ID``. The names are in lists,
-DataLink tables and provenance. A request may also give the bare id; if a product and a PSF had the same id, the bare id
-would mean the product.
+The name of a product or PSF for VO clients is ``urn:heliopsf:product:ID`` or ``urn:heliopsf:psf:ID``. The names are in
+lists, DataLink tables and provenance. A request may also give the bare id; if a product and a PSF had the same id, the
+bare id would mean the product.
 """
 
 from __future__ import annotations
@@ -64,7 +64,8 @@ class VotableErrors(PlainErrors):
 VOTABLE_ERROR: dict[int | str, dict[str, Any]] = {
     "4XX": {
         "content": {VOTABLE_TYPE: {}, "application/problem+json": {}},
-        "description": "A VOTable with QUERY_STATUS=ERROR; problem details if the service is not called by this host name",
+        "description": "A VOTable with QUERY_STATUS=ERROR; problem details if the service is not called by this host "
+        "name",
     }
 }
 LIST: dict[str, Any] = {
@@ -129,7 +130,9 @@ def row_named(state: State, caller: Caller, name: str) -> ProductRow | PsfRow | 
 
 
 def product_record(row: ProductRow, image: ImageRow | None, base: str) -> dict[str, Any]:
-    """The values of a product's columns. image: the input; None if the service does not keep it (bulk runs over an archive)."""
+    """The values of a product's columns. image: the input; None if the service does not keep it (bulk runs over an
+    archive).
+    """
     seen: Mapping[str, Any] = {} if image is None else image.summary
     shape, cards = seen.get("shape", (None, None)), seen.get("cards", {})
     scales = [plate_scale_arcsec(cards, axis) for axis in (1, 2)]

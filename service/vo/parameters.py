@@ -1,7 +1,7 @@
 """Reads the parameters of requests by the rules of IVOA DALI, and answers errors as DALI says.
 
-Citation: IVOA DALI 1.1 (17 May 2017), sections 2.1, 3 and 4.4. The names of parameters may have upper or lower case; they are in
-the address or in a form. A parameter that an endpoint does not know is ignored. An answer that is a VOTable
+Citation: IVOA DALI 1.1 (17 May 2017), sections 2.1, 3 and 4.4. The names of parameters may have upper or lower case;
+they are in the address or in a form. A parameter that an endpoint does not know is ignored. An answer that is a VOTable
 reports an error as a VOTable with QUERY_STATUS=ERROR; other answers report it as plain text.
 """
 
@@ -25,7 +25,8 @@ MAX_FIELDS = 64
 SHOWN = 120
 # What to do instead of sending a file with a job (DALI's UPLOAD).
 UPLOAD_FIRST = (
-    "upload each input of a job first, by POST /v1/images, /v1/psfs or /v1/transits, and send its id in the field image_id, mask_id, "
+    "upload each input of a job first, by POST /v1/images, /v1/psfs or /v1/transits, and send its id in the field "
+    "image_id, mask_id, "
     "psf_id or transit_id"
 )
 # Characters that XML 1.0 cannot contain.
@@ -167,7 +168,8 @@ def format_of(fields: Mapping[str, list[str]], *allowed: str) -> str:
 PLAIN_ERRORS: dict[str | int, dict[str, Any]] = {
     "4XX": {
         "content": {"text/plain": {}, "application/problem+json": {}},
-        "description": "What was expected, what was received, and what to do next; as problem details if the request is not "
+        "description": "What was expected, what was received, and what to do next; as problem details if the request "
+        "is not "
         "permitted from its origin or under this host name.",
     }
 }

@@ -1,10 +1,10 @@
-"""VOTables (IVOA VOTable 1.4, 21 October 2019): the columns of the lists of products and PSFs and of DataLink tables, and their
-documents, which ``astropy.io.votable`` writes.
+"""VOTables (IVOA VOTable 1.4, 21 October 2019): the columns of the lists of products and PSFs and of DataLink tables,
+and their documents, which ``astropy.io.votable`` writes.
 
-Citation: IVOA ObsCore 1.1 (9 May 2017), tables 6 and 7; IVOA DataLink 1.1 (15 December 2023), section 3.2. Every list has the
-columns of ObsCore that are mandatory, in the same order, so that a catalogue can ingest it; columns of this service follow. A
-value is null if the service does not know it. The position on the sky is always null: ObsCore gives it in
-equatorial coordinates, and the Sun moves in them.
+Citation: IVOA ObsCore 1.1 (9 May 2017), tables 6 and 7; IVOA DataLink 1.1 (15 December 2023), section 3.2. Every list
+has the columns of ObsCore that are mandatory, in the same order, so that a catalogue can ingest it; columns of this
+service follow. A value is null if the service does not know it. The position on the sky is always null: ObsCore gives
+it in equatorial coordinates, and the Sun moves in them.
 """
 
 from __future__ import annotations
@@ -51,46 +51,174 @@ class Table:
 
 
 def _obscore(
-    name: str, utype: str, ucd: str, description: str, datatype: str = "char", unit: str | None = None, xtype: str | None = None
-) -> Column:  # fmt: skip
+    name: str,
+    utype: str,
+    ucd: str,
+    description: str,
+    datatype: str = "char",
+    unit: str | None = None,
+    xtype: str | None = None,
+) -> Column:
     return Column(name, description, datatype, unit, ucd, f"obscore:{utype}", xtype)
 
 
 OBSCORE = (
     _obscore("dataproduct_type", "ObsDataset.dataProductType", "meta.code.class", "Type of the data: image"),
-    _obscore("calib_level", "ObsDataset.calibLevel", "meta.code;obs.calib", "Level of the calibration; 3: a derived product", "int"),
+    _obscore(
+        "calib_level",
+        "ObsDataset.calibLevel",
+        "meta.code;obs.calib",
+        "Level of the calibration; 3: a derived product",
+        "int",
+    ),
     _obscore("obs_collection", "DataID.collection", "meta.id", "Collection to which the data belong"),
-    _obscore("obs_id", "DataID.observationID", "meta.id", "Id of the observation: the SHA-256 of the input image; for a PSF its id"),
-    _obscore("obs_publisher_did", "Curation.publisherDID", "meta.ref.ivoid", "Id of the product or PSF for /vo/links and /vo/cutout"),
-    _obscore("access_url", "Access.reference", "meta.ref.url", "Address of the DataLink table with all files of the product or PSF"),
+    _obscore(
+        "obs_id",
+        "DataID.observationID",
+        "meta.id",
+        "Id of the observation: the SHA-256 of the input image; for a PSF its id",
+    ),
+    _obscore(
+        "obs_publisher_did",
+        "Curation.publisherDID",
+        "meta.ref.ivoid",
+        "Id of the product or PSF for /vo/links and /vo/cutout",
+    ),
+    _obscore(
+        "access_url",
+        "Access.reference",
+        "meta.ref.url",
+        "Address of the DataLink table with all files of the product or PSF",
+    ),
     _obscore("access_format", "Access.format", "meta.code.mime", "Media type at access_url"),
-    _obscore("access_estsize", "Access.size", "phys.size;meta.file", "Size of the FITS file", "long", "kbyte"),
+    _obscore(
+        "access_estsize", "Access.size", "phys.size;meta.file", "Size of the FITS file", "long", "kbyte"
+    ),
     _obscore("target_name", "Target.name", "meta.id;src", "Observed object"),
-    _obscore("s_ra", "Char.SpatialAxis.Coverage.Location.Coord.Position2D.Value2.C1", "pos.eq.ra", "Right ascension; null", "double", "deg"),
-    _obscore("s_dec", "Char.SpatialAxis.Coverage.Location.Coord.Position2D.Value2.C2", "pos.eq.dec", "Declination; null", "double", "deg"),
-    _obscore("s_fov", "Char.SpatialAxis.Coverage.Bounds.Extent.diameter", "phys.angSize;instr.fov", "Width or height of the field of view, whichever is larger", "double", "deg"),
-    _obscore("s_region", "Char.SpatialAxis.Coverage.Support.Area", "pos.outline;obs.field", "Region on the sky; null"),
-    _obscore("s_resolution", "Char.SpatialAxis.Resolution.Refval.value", "pos.angResolution", "Angular resolution; null", "double", "arcsec"),
+    _obscore(
+        "s_ra",
+        "Char.SpatialAxis.Coverage.Location.Coord.Position2D.Value2.C1",
+        "pos.eq.ra",
+        "Right ascension; null",
+        "double",
+        "deg",
+    ),
+    _obscore(
+        "s_dec",
+        "Char.SpatialAxis.Coverage.Location.Coord.Position2D.Value2.C2",
+        "pos.eq.dec",
+        "Declination; null",
+        "double",
+        "deg",
+    ),
+    _obscore(
+        "s_fov",
+        "Char.SpatialAxis.Coverage.Bounds.Extent.diameter",
+        "phys.angSize;instr.fov",
+        "Width or height of the field of view, whichever is larger",
+        "double",
+        "deg",
+    ),
+    _obscore(
+        "s_region",
+        "Char.SpatialAxis.Coverage.Support.Area",
+        "pos.outline;obs.field",
+        "Region on the sky; null",
+    ),
+    _obscore(
+        "s_resolution",
+        "Char.SpatialAxis.Resolution.Refval.value",
+        "pos.angResolution",
+        "Angular resolution; null",
+        "double",
+        "arcsec",
+    ),
     _obscore("s_xel1", "Char.SpatialAxis.numBins1", "meta.number", "Number of columns", "long"),
     _obscore("s_xel2", "Char.SpatialAxis.numBins2", "meta.number", "Number of rows", "long"),
-    _obscore("t_min", "Char.TimeAxis.Coverage.Bounds.Limits.StartTime", "time.start;obs.exposure", "Start of the exposure (MJD); for a PSF start of its validity", "double", "d"),
-    _obscore("t_max", "Char.TimeAxis.Coverage.Bounds.Limits.StopTime", "time.end;obs.exposure", "End of the exposure (MJD); for a PSF end of its validity", "double", "d"),
-    _obscore("t_exptime", "Char.TimeAxis.Coverage.Support.Extent", "time.duration;obs.exposure", "Exposure time", "double", "s"),
-    _obscore("t_resolution", "Char.TimeAxis.Resolution.Refval.value", "time.resolution", "Resolution in time: the exposure time", "double", "s"),
+    _obscore(
+        "t_min",
+        "Char.TimeAxis.Coverage.Bounds.Limits.StartTime",
+        "time.start;obs.exposure",
+        "Start of the exposure (MJD); for a PSF start of its validity",
+        "double",
+        "d",
+    ),
+    _obscore(
+        "t_max",
+        "Char.TimeAxis.Coverage.Bounds.Limits.StopTime",
+        "time.end;obs.exposure",
+        "End of the exposure (MJD); for a PSF end of its validity",
+        "double",
+        "d",
+    ),
+    _obscore(
+        "t_exptime",
+        "Char.TimeAxis.Coverage.Support.Extent",
+        "time.duration;obs.exposure",
+        "Exposure time",
+        "double",
+        "s",
+    ),
+    _obscore(
+        "t_resolution",
+        "Char.TimeAxis.Resolution.Refval.value",
+        "time.resolution",
+        "Resolution in time: the exposure time",
+        "double",
+        "s",
+    ),
     _obscore("t_xel", "Char.TimeAxis.numBins", "meta.number", "Number of times", "long"),
-    _obscore("em_min", "Char.SpectralAxis.Coverage.Bounds.Limits.LoLimit", "em.wl;stat.min", "Wavelength that names the channel", "double", "m"),
-    _obscore("em_max", "Char.SpectralAxis.Coverage.Bounds.Limits.HiLimit", "em.wl;stat.max", "Wavelength that names the channel", "double", "m"),
-    _obscore("em_res_power", "Char.SpectralAxis.Resolution.ResolPower.refVal", "spect.resolution", "Spectral resolving power; null", "double"),
+    _obscore(
+        "em_min",
+        "Char.SpectralAxis.Coverage.Bounds.Limits.LoLimit",
+        "em.wl;stat.min",
+        "Wavelength that names the channel",
+        "double",
+        "m",
+    ),
+    _obscore(
+        "em_max",
+        "Char.SpectralAxis.Coverage.Bounds.Limits.HiLimit",
+        "em.wl;stat.max",
+        "Wavelength that names the channel",
+        "double",
+        "m",
+    ),
+    _obscore(
+        "em_res_power",
+        "Char.SpectralAxis.Resolution.ResolPower.refVal",
+        "spect.resolution",
+        "Spectral resolving power; null",
+        "double",
+    ),
     _obscore("em_xel", "Char.SpectralAxis.numBins", "meta.number", "Number of wavelengths", "long"),
     _obscore("o_ucd", "Char.ObservableAxis.ucd", "meta.ucd", "UCD of the pixels"),
-    _obscore("pol_states", "Char.PolarizationAxis.stateList", "meta.code;phys.polarization", "Polarization states; null"),
-    _obscore("pol_xel", "Char.PolarizationAxis.numBins", "meta.number", "Number of polarization states", "long"),
-    _obscore("facility_name", "Provenance.ObsConfig.Facility.name", "meta.id;instr.tel", "Observatory or spacecraft"),
+    _obscore(
+        "pol_states",
+        "Char.PolarizationAxis.stateList",
+        "meta.code;phys.polarization",
+        "Polarization states; null",
+    ),
+    _obscore(
+        "pol_xel", "Char.PolarizationAxis.numBins", "meta.number", "Number of polarization states", "long"
+    ),
+    _obscore(
+        "facility_name",
+        "Provenance.ObsConfig.Facility.name",
+        "meta.id;instr.tel",
+        "Observatory or spacecraft",
+    ),
     _obscore("instrument_name", "Provenance.ObsConfig.Instrument.name", "meta.id;instr", "Instrument"),
     _obscore("obs_title", "DataID.title", "meta.title;obs", "Title"),
-    _obscore("obs_creation_date", "DataID.date", "time.creation;meta.dataset", "Time at which the product or PSF was made", xtype="timestamp"),
+    _obscore(
+        "obs_creation_date",
+        "DataID.date",
+        "time.creation;meta.dataset",
+        "Time at which the product or PSF was made",
+        xtype="timestamp",
+    ),
     _obscore("obs_creator_name", "DataID.creator", "meta.id", "Owner"),
-)  # fmt: skip
+)
 _FILE = (
     Column("file_url", "Address of the FITS file", ucd="meta.ref.url;meta.fits"),
     Column("file_sha256", "SHA-256 of the FITS file", ucd="meta.checksum"),
@@ -106,9 +234,14 @@ PRODUCTS = Table(
         Column("psf_id", "Id of the PSF", ucd="meta.id;instr.det.psf"),
         Column("psf_version", "Version of the PSF", ucd="meta.version"),
         Column("method", "Method of the deconvolution", ucd="meta.id"),
-        Column("artefact_score", "Artefact score: large where a product shows signs of over-deconvolution", "double", ucd="stat.value"),
+        Column(
+            "artefact_score",
+            "Artefact score: large where a product shows signs of over-deconvolution",
+            "double",
+            ucd="stat.value",
+        ),
     ),
-)  # fmt: skip
+)
 PSFS = Table(
     "psfs",
     "PSFs: point-spread functions of instruments",

@@ -34,7 +34,8 @@ DEPLOY = Path(__file__).parents[2] / "deploy"
 
 
 def resources(folder: Path) -> list[dict[str, Any]]:
-    """The manifests that the kustomization in a folder names, and those of the folders that it names, without its patches."""
+    """The manifests that the kustomization in a folder names, and those of the folders that it names, without its
+    patches."""
     kustomization = yaml.safe_load((folder / "kustomization.yaml").read_text("utf-8"))
     found: list[dict[str, Any]] = []
     for path in (folder / name for name in kustomization["resources"]):

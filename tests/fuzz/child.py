@@ -1,7 +1,7 @@
 """Reads inputs one after the other in a process of its own, under the memory limit of a job.
 
-`python -m tests.fuzz.child '{"KIND": COUNT, ...}' FOLDER` writes a line for each seed of each kind: "result", the code of a
-DataError, or a fault. If the process dies, it dies with the seed after the last line.
+`python -m tests.fuzz.child '{"KIND": COUNT, ...}' FOLDER` writes a line for each seed of each kind: "result", the code
+of a DataError, or a fault. If the process dies, it dies with the seed after the last line.
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ SIZE_PX = 64
 
 
 def read_an_image(content: bytes, folder: Path) -> str:
-    """Read an image twice, with different contents of fresh memory in the process that decodes it, and write a product from it."""
+    """Read an image twice, with different contents of fresh memory in the process that decodes it, and write a product
+    from it."""
     path, product = folder / "input.fits", folder / "product.fits"
     path.write_bytes(content)
     try:

@@ -12,9 +12,41 @@ import numpy as np
 from psfcore.instruments.files import instrument_names, instrument_path
 
 VALUES: tuple[Any, ...] = (
-    *(None, True, False, 0, -1, 1, 2**31, 2**63, 10**30, 1e308, -1e308, 1e-308, 0.5, float("nan"), float("inf"), "", "x"),
-    *("transit/1", "../a.fits", "a/b", "C:x", "a\0b", "\u202e", "$\\frac{$", "a" * 300, [], {}, [[]], [{}], {"file": 1}),
-)  # fmt: skip
+    *(
+        None,
+        True,
+        False,
+        0,
+        -1,
+        1,
+        2**31,
+        2**63,
+        10**30,
+        1e308,
+        -1e308,
+        1e-308,
+        0.5,
+        float("nan"),
+        float("inf"),
+        "",
+        "x",
+    ),
+    *(
+        "transit/1",
+        "../a.fits",
+        "a/b",
+        "C:x",
+        "a\0b",
+        "\u202e",
+        "$\\frac{$",
+        "a" * 300,
+        [],
+        {},
+        [[]],
+        [{}],
+        {"file": 1},
+    ),
+)
 NUMBERS = ("0", "-1", "1e-9", "1e9", "-1e300", "nan", "inf", "1", "2", "0.5", "255", "257", "9999", "10001")
 # Tables and keys that no shipped instrument has, or not so many of.
 TABLES = (

@@ -76,8 +76,8 @@ def saturated() -> Pixels:
 
 @dataclass(frozen=True)
 class Content:
-    """stored: the numbers in the file. bad: pixels [y, x] that QUALITY must mark with `bit`. codes: of the warnings about the image.
-    planes: further HDUs. cut: forms that cannot hold this content."""
+    """stored: the numbers in the file. bad: pixels [y, x] that QUALITY must mark with `bit`. codes: of the warnings
+    about the image. planes: further HDUs. cut: forms that cannot hold this content."""
 
     stored: Pixels
     cards: dict[str, Any] = field(default_factory=dict)
@@ -123,13 +123,26 @@ CONTENTS: dict[str, Content] = {
     "blank": Content(holed(-32768), {"BLANK": -32768}, HOLE, LOST, frozenset({"lost"})),
     "blank of 0": Content(holed(0), {"BLANK": 0}, HOLE, LOST, frozenset({"lost"})),
     "blank of unsigned": Content(
-        holed(32767, shift=32768), {"BZERO": 32768, "BSCALE": 1, "BLANK": 32767}, HOLE, LOST, frozenset({"lost"})
+        holed(32767, shift=32768),
+        {"BZERO": 32768, "BSCALE": 1, "BLANK": 32767},
+        HOLE,
+        LOST,
+        frozenset({"lost"}),
     ),
     "blank of unsigned, compressed": Content(
-        holed(32767, shift=32768), {"BZERO": 32768, "BSCALE": 1, "BLANK": 32767}, HOLE, LOST, frozenset({"lost"}), compressed=True
+        holed(32767, shift=32768),
+        {"BZERO": 32768, "BSCALE": 1, "BLANK": 32767},
+        HOLE,
+        LOST,
+        frozenset({"lost"}),
+        compressed=True,
     ),
     "blank of scaled": Content(
-        holed(-32768, level=50, scale=16), {"BSCALE": 1 / 16, "BZERO": 0, "BLANK": -32768}, HOLE, LOST, frozenset({"lost"})
+        holed(-32768, level=50, scale=16),
+        {"BSCALE": 1 / 16, "BZERO": 0, "BLANK": -32768},
+        HOLE,
+        LOST,
+        frozenset({"lost"}),
     ),
     "filled": Content(holed(-999), {"NMISSING": 16}, HOLE, LOST, frozenset({"lost"})),
     "nan": Content(np.where(flags() > 0, np.nan, scene()).astype(np.float32), {}, HOLE),
@@ -137,24 +150,47 @@ CONTENTS: dict[str, Content] = {
     "faint": Content(np.random.default_rng(4).poisson(0.4, (N, N)).astype(np.int16)),
     "wrapped": Content(wrapped(), {}, (slice(29, 32), slice(59, 62)), codes=frozenset({"wrapped"})),
     "level": Content(saturated().astype(np.float32), {"NSATPIX": 100}, FLARE, SATURATED),
-    "level of a rate": Content((saturated() / 2).astype(np.float32), {"NSATPIX": 100, "BUNIT": "DN/s"}, FLARE, SATURATED),
+    "level of a rate": Content(
+        (saturated() / 2).astype(np.float32), {"NSATPIX": 100, "BUNIT": "DN/s"}, FLARE, SATURATED
+    ),
     "level without exposure": Content(
-        (saturated() / 2).astype(np.float32), {"NSATPIX": 100, "BUNIT": "DN/s", "EXPTIME": None}, FLARE, SATURATED, frozenset({"saturation"})
+        (saturated() / 2).astype(np.float32),
+        {"NSATPIX": 100, "BUNIT": "DN/s", "EXPTIME": None},
+        FLARE,
+        SATURATED,
+        frozenset({"saturation"}),
     ),
     "level after a correction": Content(
         (saturated() / 0.3).astype(np.float32), {"NSATPIX": 100}, FLARE, SATURATED, frozenset({"saturation"})
     ),
     "level in DN of a rate": Content(
-        (saturated() / 8).astype(np.float32), {"DSATVAL": 15000.0, "DATASAT": 100, "BUNIT": "DN/s"}, FLARE, SATURATED, base=EUVI
+        (saturated() / 8).astype(np.float32),
+        {"DSATVAL": 15000.0, "DATASAT": 100, "BUNIT": "DN/s"},
+        FLARE,
+        SATURATED,
+        base=EUVI,
     ),
-    "numbers as text": Content((saturated() / 2).astype(np.float32), {"NSATPIX": "100", "BUNIT": "DN/s", "EXPTIME": "2.0"}, FLARE, SATURATED),
+    "numbers as text": Content(
+        (saturated() / 2).astype(np.float32),
+        {"NSATPIX": "100", "BUNIT": "DN/s", "EXPTIME": "2.0"},
+        FLARE,
+        SATURATED,
+    ),
     "quality plane": Content(
-        scene().astype(np.float32), {}, HOLE, codes=frozenset({"quality-plane"}), planes=(("DQF", flags()),), not_in=MEMORY
+        scene().astype(np.float32),
+        {},
+        HOLE,
+        codes=frozenset({"quality-plane"}),
+        planes=(("DQF", flags()),),
+        not_in=MEMORY,
     ),
     "several images": Content(
-        scene().astype(np.int16), codes=frozenset({"several-images"}), planes=(("OTHER", scene()),), not_in=MEMORY
+        scene().astype(np.int16),
+        codes=frozenset({"several-images"}),
+        planes=(("OTHER", scene()),),
+        not_in=MEMORY,
     ),
-}  # fmt: skip
+}
 
 
 def write(path: Path, content: Content) -> Path:

@@ -1,4 +1,5 @@
-"""The docstrings of what `heliopsf` offers have the sections of numpydoc, and name every parameter, result and field."""
+"""The docstrings of what `heliopsf` offers have the sections of numpydoc, and name every parameter, result and
+field."""
 
 from __future__ import annotations
 
@@ -25,7 +26,8 @@ RESULTS = (heliopsf.Deconvolution, heliopsf.GapDiagnosis, heliopsf.ScatterFit)
 
 
 def _names() -> Iterator[str]:
-    """Every public name, and every public method and property: as the class of this project that documents it has it."""
+    """Every public name, and every public method and property: as the class of this project that documents it has
+    it."""
     for public in heliopsf.__all__:
         yield f"heliopsf.{public}"
         value = getattr(heliopsf, public)

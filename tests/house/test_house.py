@@ -84,7 +84,8 @@ def test_what_people_import_stands_on_the_core_the_client_and_the_machine_alone(
     assert wrong == []
 
 
-# Where the libraries that take files of strangers apart may be imported, and why. Everything in "child" runs in a limited process.
+# Where the libraries that take files of strangers apart may be imported, and why. Everything in "child" runs in a
+# limited process.
 UNPACKING = {
     "psfcore/fits/gzipped.py": "child",
     "psfcore/fits/hdus.py": "child; zlib.error is one of the errors that it tells",

@@ -1,4 +1,5 @@
-"""Comparison of two arrays that are equal, close, far apart or of different shapes; the scaled inverse for any units."""
+"""Comparison of two arrays that are equal, close, far apart or of different shapes; the scaled inverse for any
+units."""
 
 from __future__ import annotations
 

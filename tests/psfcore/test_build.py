@@ -230,7 +230,8 @@ def test_a_wide_aperture_is_analytic_and_leaves_the_mount_out(small_reach: None)
 
 
 def test_a_sector_and_a_hexagonal_mesh_are_built_by_both_routes(small_reach: None) -> None:
-    """The mask and the edges of the same pupil give the same light beyond a pixel; the hexagonal mesh keeps its orders."""
+    """The mask and the edges of the same pupil give the same light beyond a pixel; the hexagonal mesh keeps its
+    orders."""
     sector = Aperture(diameter_mm=100.0, sector=Sector(first_angle_deg=0.0, opening_deg=90.0))
     mesh = replace(FINE_MESH, openings="hexagonal", basis="assumed")
     masked, wide = (
@@ -283,7 +284,8 @@ def test_a_mask_image_replaces_the_bars_of_the_mount(small_reach: None) -> None:
 def test_the_psf_of_turned_images_has_all_parts_at_their_angles_on_the_images(
     small_reach: None, tmp_path: Path
 ) -> None:
-    """The image is turned by 90 degrees and the mount has one bar, so the PSF is that of the detector after a quarter turn."""
+    """The image is turned by 90 degrees and the mount has one bar, so the PSF is that of the detector after a quarter
+    turn."""
     bar = "[mount]\nbasis = 'assumed'\nrays = [{ count = 1, width_mm = 0.5, first_angle_deg = 0.0 }]\n"
     corners = "[[1.0, 0.5], [1.5, 0.5], [1.5, 1.0]]"
     text = SMALL_INSTRUMENT + bar + f"polygons = [{{ corners_mm = {corners} }}]\n"

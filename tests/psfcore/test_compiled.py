@@ -221,8 +221,9 @@ if not prepared:
 
 
 def test_a_kernel_that_is_called_by_its_address_is_kept_and_loaded(tmp_path: Path) -> None:
-    """Its address differs between processes, so a kernel on disk must not contain the address. A process that only loads
-    kernels does not prepare numba's compiler, which imports all functions that numba knows. It can compile others later.
+    """Its address differs between processes, so a kernel on disk must not contain the address. A process that only
+    loads kernels does not prepare numba's compiler, which imports all functions that numba knows. It can compile others
+    later.
     """
     said = [
         subprocess.run(

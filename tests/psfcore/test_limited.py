@@ -1,4 +1,5 @@
-"""A function that reads a file of strangers may do what it likes in its process: the caller gets an answer or an error."""
+"""A function that reads a file of strangers may do what it likes in its process: the caller gets an answer or an
+error."""
 
 from __future__ import annotations
 

@@ -175,7 +175,8 @@ def execute(catalogue: Catalogue, statement: Executable) -> None:
 
 
 def one_of_everything(service: Keyed, folder: Path) -> dict[str, str]:
-    """Ids of ann's, one of each kind, by the names that they have in addresses. folder: for the files that are uploaded."""
+    """Ids of ann's, one of each kind, by the names that they have in addresses. folder: for the files that are
+    uploaded."""
     write_image(folder / "image.fits")
     write_psf(folder / "psf.fits")
     pack(write_transit(folder / "transit", images=3), folder / "transit.tar")

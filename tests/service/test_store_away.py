@@ -1,4 +1,5 @@
-"""The service while its object store hangs or answers wrongly: what needs no store does not wait, and nothing is given up."""
+"""The service while its object store hangs or answers wrongly: what needs no store does not wait, and nothing is given
+up."""
 
 from __future__ import annotations
 

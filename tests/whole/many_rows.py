@@ -60,7 +60,8 @@ class Archive:
 
 
 def fill(catalogue: Catalogue, url: str, size: Size) -> Archive:
-    """Rows in series, with statuses and ranges, products by the handful a PSF and a great many of one; by statements."""
+    """Rows in series, with statuses and ranges, products by the handful a PSF and a great many of one; by
+    statements."""
     archive = Archive(catalogue, create_engine(url), size)
     sqlite = archive.engine.dialect.name == "sqlite"
     hexed = "printf('%064x', {})" if sqlite else "lpad(to_hex(cast({} as bigint)), 64, '0')"
@@ -101,8 +102,8 @@ def fill(catalogue: Catalogue, url: str, size: Size) -> Archive:
         f"""{numbers.format(size.products)}
         INSERT INTO products (owner, id, created_at, kind, image_id, psf_id, psf_version, file_sha256, bytes,
             preview_sha256, details)
-        SELECT '{OWNER}', {key("n")}, 1e9 + n, 'deconvolved-image', {key("n / 4")}, {key(of_psf)}, '1.0.0', {key("n")}, n,
-            {key("n")}, '{{"job_id": "0", "parameters": {{"steps": 20}}}}'
+        SELECT '{OWNER}', {key("n")}, 1e9 + n, 'deconvolved-image', {key("n / 4")}, {key(of_psf)}, '1.0.0',
+            {key("n")}, n, {key("n")}, '{{"job_id": "0", "parameters": {{"steps": 20}}}}'
         FROM n""",
         f"""{numbers.format(size.psfs)}
         INSERT INTO psf_changes (owner, psf_id, at, by, status_before, status, version_before, version, reason)

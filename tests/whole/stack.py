@@ -57,7 +57,8 @@ class Stack:
         self.client = Client()
 
     def start_server(self, port: int = 0) -> None:
-        """Start the service at a port; 0: any free one. What it says is in ``server.out``, and its errors in ``server.log``."""
+        """Start the service at a port; 0: any free one. What it says is in ``server.out``, and its errors in
+        ``server.log``."""
         folder = self.data.parent
         self.server = subprocess.Popen(
             [

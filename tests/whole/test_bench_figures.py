@@ -25,7 +25,8 @@ def rows(*changed: Figure) -> str:
 
 
 def test_a_figure_is_compared_with_its_goal_and_the_stored_one() -> None:
-    """A time counts as a ratio to the unit of its run; a figure that is 20 % worse is named, and so is one not measured."""
+    """A time counts as a ratio to the unit of its run; a figure that is 20 % worse is named, and so is one not
+    measured."""
     slow_machine = rows(Figure(TIME, 2.0, 0.2))
     assert all(
         one in slow_machine for one in ("x 1.00", "goal <= 1.1 s", "missed", f"not measured: {MEMORY}")

@@ -122,8 +122,8 @@ def test_a_bulk_run_goes_on_and_a_server_that_dies_takes_its_worker_along(
         assert left == []
 
 
-# A worker on a busy machine, whose processes need long to load their libraries. Python imports this module when it starts.
-# Celery waits 4 s for a process that replaces another one, unless it is told to wait longer.
+# A worker on a busy machine, whose processes need long to load their libraries. Python imports this module when it
+# starts. Celery waits 4 s for a process that replaces another one, unless it is told to wait longer.
 SLOW_START = """
 import time
 from celery.signals import worker_process_init
@@ -290,8 +290,8 @@ def test_files_are_kept_in_s3_and_found_there_again(
 def test_a_server_lets_requests_end_and_does_not_wait_for_those_that_do_not(
     tmp_path: Path, stop_s: float
 ) -> None:
-    """With half an upload on the line: gone after stop_s; or, where the rest comes in time, after the answer. A request that
-    waits for a job without end is answered at once."""
+    """With half an upload on the line: gone after stop_s; or, where the rest comes in time, after the answer. A request
+    that waits for a job without end is answered at once."""
     with stacks.alone(tmp_path, {"HELIOPSF_STOP_S": str(stop_s)}) as stack:
         assert stack.server is not None
         url = stack.client.server

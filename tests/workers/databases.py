@@ -12,7 +12,8 @@ from sqlalchemy import Executable, create_engine, text
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.database import Database
 
-# A test with this mark runs on both; others run on SQLite. It is for claims, leases, locks, clocks and plans of queries.
+# A test with this mark runs on both; others run on SQLite. It is for claims, leases, locks, clocks and plans of
+# queries.
 BOTH = pytest.mark.parametrize("catalogue", ["sqlite", "postgresql"], indirect=True)
 
 

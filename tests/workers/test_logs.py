@@ -6,7 +6,6 @@ import io
 import json
 import logging
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -17,10 +16,10 @@ from workers.settings import Settings
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[float]]:
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     now = [100.0]
     monkeypatch.setattr("workers.logs.time.monotonic", lambda: now[0])
-    yield now
+    return now
 
 
 def record(message: str, *values: object, level: int = logging.WARNING) -> logging.LogRecord:

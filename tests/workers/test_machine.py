@@ -1,4 +1,5 @@
-"""The memory that a process may use, what of it is free; the cache of built PSFs, the default data folder, and settings."""
+"""The memory that a process may use, what of it is free; the cache of built PSFs, the default data folder, and
+settings."""
 
 from __future__ import annotations
 

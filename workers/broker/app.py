@@ -1,8 +1,8 @@
 """The broker: a Celery application, and the submission of job ids to it.
 
 The broker may lose messages or deliver them twice: lost jobs are submitted again from the job table, and a second
-delivery has no effect. Therefore messages need not be durable. Jobs are submitted by the name of the Celery task, because
-the web process must not import tasks.
+delivery has no effect. Therefore messages need not be durable. Jobs are submitted by the name of the Celery task,
+because the web process must not import tasks.
 """
 
 from __future__ import annotations
@@ -65,7 +65,8 @@ def make_app(settings: Settings) -> Celery:
 
 def submit(app: Celery, job_id: str, queue: Queue = Queue.INTERACTIVE) -> bool:
     """Send the id of a job to the broker. Returns False if the broker does not answer; the reconciler then tries
-    again."""
+    again.
+    """
     try:
         app.send_task(RUN_JOB, args=[job_id], queue=broker_name(queue), retry=False)
     except AWAY as error:
@@ -75,7 +76,9 @@ def submit(app: Celery, job_id: str, queue: Queue = Queue.INTERACTIVE) -> bool:
 
 
 def call_for_help(app: Celery, job_id: str, workers: int) -> None:
-    """Ask idle workers to share the work of a job. If the messages are lost, the worker that runs the job does all of the work."""
+    """Ask idle workers to share the work of a job. If the messages are lost, the worker that runs the job does all of
+    the work.
+    """
     try:
         for _ in range(workers):
             app.send_task(ASSIST, args=[job_id], queue=broker_name(Queue.CROSSVAL), retry=False)

@@ -102,11 +102,14 @@ def _sift(response: list[bytes] | None) -> tuple[bytes, str] | None:
 
 
 class _FolderChannel(filesystem.Channel):
-    """Writes files atomically and reads plain files only. Kombu's own channel would hang if a file is empty, incompletely
-    written or a named pipe."""
+    """Writes files atomically and reads plain files only. Kombu's own channel would hang if a file is empty,
+    incompletely written or a named pipe.
+    """
 
     def get_table(self, exchange: str) -> list[Any]:
-        """The queues bound to an exchange; empty if the file is damaged, for example by a power failure, or no plain file."""
+        """The queues bound to an exchange; empty if the file is damaged, for example by a power failure, or no plain
+        file.
+        """
         if not self._exchange_file(exchange).is_file():
             return []
         try:
@@ -173,7 +176,8 @@ class FolderTransport(filesystem.Transport):
     Channel = _FolderChannel
 
     def drain_events(self, connection: Any, timeout: float | None = None, **_: Any) -> None:
-        """Deliver one message. Raises ``TimeoutError`` if no message arrives in time, or at once if the worker must stop.
+        """Deliver one message. Raises ``TimeoutError`` if no message arrives in time, or at once if the worker must
+        stop.
 
         Celery checks whether the worker must stop only between two calls of this method. Kombu's own version sleeps
         twice for a few seconds, which would delay the stop.
@@ -216,7 +220,8 @@ class PatientConsumer(Consumer):
 
 
 class TakeWhatCanStart(bootsteps.StartStopStep):
-    """Keeps a worker from taking messages while all its processes are busy, and messages that this service did not send.
+    """Keeps a worker from taking messages while all its processes are busy, and messages that this service did not
+    send.
 
     Celery's ``worker_disable_prefetch`` does the first, but only for Redis.
     """
@@ -225,7 +230,8 @@ class TakeWhatCanStart(bootsteps.StartStopStep):
 
     def start(self, consumer: Any) -> None:
         """Make the channel check whether the pool has an idle process, before it checks its own limit of messages;
-        for Redis, also make it drop messages that this service did not send."""
+        for Redis, also make it drop messages that this service did not send.
+        """
         channel = consumer.task_consumer.channel
         if isinstance(channel, redis.Channel):
             channel.client.set_response_callback("BRPOP", _sift)

@@ -50,11 +50,14 @@ class Refused(BaseModel):
 
 
 class BulkEstimate(BaseModel):
-    """What a bulk run would do. Only a sample of the images is examined; the figures of the run are scaled up from it."""
+    """What a bulk run would do. Only a sample of the images is examined; the figures of the run are scaled up from
+    it.
+    """
 
     images: int = Field(description="images that were found")
     complete: bool = Field(
-        description=f"false: {BUDGET_S:g} s were not enough to list all files and to examine the sample, so the run may have more images "
+        description=f"false: {BUDGET_S:g} s were not enough to list all files and to examine the sample, so the run "
+        "may have more images "
         "than are counted here, or the sample fewer than were asked for",
     )
     examined: int = Field(description="images of the sample whose headers were read")
@@ -70,7 +73,8 @@ class BulkEstimate(BaseModel):
     workers: int = Field(description="worker processes now; 1 if there are none")
     memory_mib: int = Field(description="memory that the largest examined image needs")
     example_output: str | None = Field(
-        description="path of the product of an examined image in the output folder; null: there is no output folder, or the "
+        description="path of the product of an examined image in the output folder; null: there is no output folder, "
+        "or the "
         "path has the id of the product, which is not known before the run",
     )
 
@@ -84,7 +88,8 @@ def dry_run(
 ) -> BulkEstimate:
     """Examine at most ``sample`` images of a bulk run, and estimate the whole run.
 
-    Raises the same ``DataError`` as ``workers.bulk.runs.begin``, and "unreadable-folder", "too-many-images", "no-images".
+    Raises the same ``DataError`` as ``workers.bulk.runs.begin``, and "unreadable-folder", "too-many-images",
+    "no-images".
     """
     return _DryRun(request, catalogue, owner, settings).estimate(sample)
 
@@ -137,7 +142,7 @@ class _DryRun:
     def _chosen(self, sample: int) -> list[BulkImage]:
         """Count all images of the run, and choose a random sample of them. Raises the errors of listing."""
         chosen: list[BulkImage] = []
-        chance = random.Random(0)
+        chance = random.Random(0)  # noqa: S311  # a sample
         try:
             for image in self._found():
                 self._images += 1
@@ -186,7 +191,9 @@ class _DryRun:
             self._bytes += product_bytes(shape, resolved.error_draws)
 
     def _target(self, image: BulkImage, source: Source, resolved: ResolvedDeconvolve) -> Path:
-        """The path of the product. Raises DataError if the layout gives no name, or the name of another examined image."""
+        """The path of the product. Raises DataError if the layout gives no name, or the name of another examined
+        image.
+        """
         assert self._request.output is not None
         identity = product_identity(resolved)
         target = target_of(
@@ -200,7 +207,8 @@ class _DryRun:
         if first != image.source:
             raise DataError(
                 "output-name-taken",
-                f"expected a name of its own for each product; got {archive_files.shown(target)}, which is also the name for "
+                f"expected a name of its own for each product; got {archive_files.shown(target)}, which is also the "
+                "name for "
                 f"{first}: use a layout with further fields, for example {{product}}",
             )
         return target

@@ -1,4 +1,5 @@
-"""Deconvolves an image of a bulk run, which is an upload or a file. The product goes into the service, into a folder, or both.
+"""Deconvolves an image of a bulk run, which is an upload or a file. The product goes into the service, into a folder,
+or both.
 
 The work has three parts, which a turn runs in three threads for three images at the same time: `read_one`,
 `compute_one` and `write_one`.
@@ -108,7 +109,9 @@ def compute_one(workspace: CatalogueWorkspace, ready: Ready) -> Result:
 
 
 def write_one(workspace: CatalogueWorkspace, ready: Ready, result: Result) -> Outcome:
-    """Write a finished deconvolution as a product. Raises DataError "output-not-written", and OSError if the disk is full."""
+    """Write a finished deconvolution as a product. Raises DataError "output-not-written", and OSError if the disk is
+    full.
+    """
     output, target = ready.destination.run.output, ready.destination.target
     if ready.destination.run.keeps_products:
         row = workspace.keep(result)

@@ -35,13 +35,17 @@ ADD_EVERY_S = (
 
 @dataclass(frozen=True)
 class SearchPosition:
-    """How far the search for the files of a run has come. pattern: number of the pattern. names: see ``archive.Entry``."""
+    """How far the search for the files of a run has come. pattern: number of the pattern. names: see
+    ``archive.Entry``.
+    """
 
     pattern: int
     names: archive_files.Position
 
     def stored(self) -> dict[str, Any]:
-        """The position as JSON. Names may have bytes that are not UTF-8, which PostgreSQL refuses; they are written as %FF."""
+        """The position as JSON. Names may have bytes that are not UTF-8, which PostgreSQL refuses; they are written as
+        %FF.
+        """
         return {"pattern": self.pattern, "names": [quote(os.fsencode(name), safe="") for name in self.names]}
 
     @classmethod
@@ -54,7 +58,8 @@ class SearchPosition:
 def list_files(
     workspace: CatalogueWorkspace, bulk: BulkRow, added: Callable[[], None], stops: Callable[[], bool]
 ) -> None:
-    """Add the files that the patterns of a bulk run match to its images, from the position where an earlier search ended.
+    """Add the files that the patterns of a bulk run match to its images, from the position where an earlier search
+    ended.
 
     bulk: the row that ``Bulks.begin_listing`` returned for the lease of the workspace. added: called after images were
     added. stops: whether the search must end now; another turn then continues it. An error that concerns all files
@@ -131,10 +136,10 @@ def found_files(
 ) -> Iterator[tuple[SearchPosition, BulkImage | None]]:
     """Search the files that match the patterns of a request; each file is found once even if several patterns match it.
 
-    Each step of the search looks at one folder or entry: its position comes with the image that was found there, or None.
-    A file that cannot be used comes with its error. after: continue a search that ended after this position. known: paths
-    that it found, if there are several patterns. listed: number of images that are listed. Raises DataError "bad-path",
-    "path-not-allowed", "unreadable-folder", "too-many-images".
+    Each step of the search looks at one folder or entry: its position comes with the image that was found there, or
+    None. A file that cannot be used comes with its error. after: continue a search that ended after this position.
+    known: paths that it found, if there are several patterns. listed: number of images that are listed. Raises
+    DataError "bad-path", "path-not-allowed", "unreadable-folder", "too-many-images".
     """
     allowed = archive_files.roots(settings.bulk_roots)
     seen = set(known)
@@ -160,7 +165,9 @@ def found_files(
 def _listed_one(
     allowed: Sequence[Path], limits: FitsLimits, entry: archive_files.Entry, where: dict[str, Condition]
 ) -> BulkImage | None:
-    """An entry of a folder as an image of the run, with an error if the file cannot be used; None if its header does not match."""
+    """An entry of a folder as an image of the run, with an error if the file cannot be used; None if its header does
+    not match.
+    """
     failure = entry.error
     if failure is None and where:
         try:

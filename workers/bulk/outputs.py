@@ -115,7 +115,8 @@ def _folder_below(source: Path | None, roots: Sequence[Path]) -> PurePosixPath:
 def _taken(target: Path) -> DataError:
     return DataError(
         "output-name-taken",
-        f"expected a name of its own for each product; got {archive_files.shown(target)}, where another file is: use a layout with "
+        f"expected a name of its own for each product; got {archive_files.shown(target)}, where another file is: use "
+        "a layout with "
         "further fields, for example {product}, or another folder",
     )
 

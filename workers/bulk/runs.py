@@ -1,7 +1,7 @@
 """Bulk runs: made from requests, and kept at work by turns.
 
-A turn is a job in the queue ``bulk`` in which a worker deconvolves one image of a run after the other. A run has as many
-turns as there are worker processes, but never more turns than images that are left. Turns are ordinary jobs: one
+A turn is a job in the queue ``bulk`` in which a worker deconvolves one image of a run after the other. A run has as
+many turns as there are worker processes, but never more turns than images that are left. Turns are ordinary jobs: one
 worker runs each turn, a lost turn is queued again, and a worker that stops hands its turn back. After each image, a
 turn ends if jobs of other kinds wait. After a minute it ends in any case, so that turns of other bulk runs can follow.
 When the run has no work left, its turns are deleted.
@@ -83,7 +83,9 @@ def new_run(
 def resolved_image(
     bulk: BulkRow, image_id: str, summary: dict[str, Any], catalogue: Catalogue
 ) -> ResolvedDeconvolve:
-    """The deconvolution of an image of a run. Its PSF is that of the run, or the one that the run's context pins for it."""
+    """The deconvolution of an image of a run. Its PSF is that of the run, or the one that the run's context pins for
+    it.
+    """
     parameters = BulkWork.model_validate(bulk.request).parameters.model_dump()
     request = Deconvolve(image_id=image_id, psf_id=bulk.psf_id, context=bulk.context_id, **parameters)
     return resolved_deconvolution(request, summary, catalogue, bulk.owner)

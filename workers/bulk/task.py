@@ -42,7 +42,9 @@ log = logging.getLogger(__name__)
 
 
 def bulk_turn(workspace: CatalogueWorkspace, parameters: Mapping[str, Any]) -> str:
-    """Deconvolve images of a bulk run; returns the id of the run. Raises ``TurnOver`` if images are left but the turn must end."""
+    """Deconvolve images of a bulk run; returns the id of the run. Raises ``TurnOver`` if images are left but the turn
+    must end.
+    """
     bulk_id: str = parameters["bulk_id"]
     bulk = workspace.catalogue.bulks.get(bulk_id)
     if bulk is not None and bulk.phase in AT_WORK:
@@ -110,7 +112,9 @@ class _Turn:
                 raise TurnOver
 
     def close(self) -> None:
-        """Give back the image that was read ahead, and wait until the last product is written and the listing has ended."""
+        """Give back the image that was read ahead, and wait until the last product is written and the listing has
+        ended.
+        """
         self._stop.set()
         try:
             if self._ahead is not None:
@@ -127,7 +131,9 @@ class _Turn:
         return bulk is not None and bulk.phase in AT_WORK
 
     def _stopped_for_quota(self) -> bool:
-        """Stop the run if its owner's quota is used up. Returns whether it was stopped. The run can be resumed when there is room."""
+        """Stop the run if its owner's quota is used up. Returns whether it was stopped. The run can be resumed when
+        there is room.
+        """
         workspace = self._workspace
         usage = workspace.catalogue.quotas.limited(workspace.owner, workspace.settings.quota_mib)
         if usage is None or not usage.full:
@@ -227,7 +233,9 @@ class _Turn:
         return partial(self._record, item, partial(self._written, ready, result, kernel_s), read_s + kernel_s)
 
     def _made_meanwhile(self, destination: Destination) -> Outcome | None:
-        """The product of an image whose content this turn deconvolved after the image was read; None for another image."""
+        """The product of an image whose content this turn deconvolved after the image was read; None for another
+        image.
+        """
         if destination.identity not in self._product_ids:
             return None
         self._finish_writing()
@@ -239,7 +247,9 @@ class _Turn:
         return dataclasses.replace(outcome, statistics=outcome.statistics | kernel)
 
     def _record(self, item: BulkItemRow, write: Callable[[], Outcome], before_s: float) -> None:
-        """Write a product, and record the result of its image. before_s: time that the worker already spent on the image."""
+        """Write a product, and record the result of its image. before_s: time that the worker already spent on the
+        image.
+        """
         began = time.perf_counter()
         outcome = write()
         seconds = before_s + time.perf_counter() - began
@@ -275,7 +285,9 @@ class _Turn:
         return self._pool.submit(contextvars.copy_context().run, work, *arguments)
 
     def _report(self, stage: str, step: int, _steps: int) -> None:
-        """Count the stage of an image, and report the images that are done, at most once a second. Raises if the turn must stop."""
+        """Count the stage of an image, and report the images that are done, at most once a second. Raises if the turn
+        must stop.
+        """
         with self._workspace.times.step(stage, step):
             began = time.perf_counter()
             if began - self._reported_at >= TELL_EVERY_S:

@@ -29,7 +29,10 @@ from workers.catalogue.tables import Base, KeyRow
 
 log = logging.getLogger(__name__)
 OWNER = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}")
-OWNER_RULE = "1 to 64 characters: lower-case letters, digits, '.', '_' and '-'; the first character is a letter or a digit"
+OWNER_RULE = (
+    "1 to 64 characters: lower-case letters, digits, '.', '_' and '-'; the first character is a letter or a "
+    "digit"
+)
 LABEL_LENGTH = 80
 _KEY = re.compile(r"hpsf_([0-9a-f]{16})_([A-Za-z0-9_-]{43})", re.ASCII)
 MOST_SESSIONS_OF_A_KEY = 50  # a further login closes the oldest
@@ -259,8 +262,8 @@ class Sessions:
 def _make_room(session: Session, owner: str, most: int) -> None:
     """Raise ``TooManyKeys`` if an owner already has ``most`` valid keys.
 
-    Otherwise keep only the newest ``most`` of the owner's revoked and expired keys, and delete the older ones. The keys that
-    a deleted key made then count as made by the key that had made it, so that ``revoke`` still reaches them.
+    Otherwise keep only the newest ``most`` of the owner's revoked and expired keys, and delete the older ones. The keys
+    that a deleted key made then count as made by the key that had made it, so that ``revoke`` still reaches them.
     """
     lock_owner(session, owner)  # simultaneous requests are counted one after the other
     good = _good_keys().where(KeyRow.owner == owner)

@@ -27,7 +27,9 @@ class AffectedProduct:
 
 @dataclass(frozen=True)
 class PageEnd:
-    """The last product of a page of the list. PSFs are sorted by id; the products of each PSF are sorted newest first."""
+    """The last product of a page of the list. PSFs are sorted by id; the products of each PSF are sorted newest
+    first.
+    """
 
     psf_id: str
     created_at: float

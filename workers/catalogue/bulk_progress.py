@@ -30,7 +30,8 @@ class Pace:
 @dataclass(frozen=True)
 class Reason:
     """The failed images of a run with the same error code. images: their number. example: the first of them in the
-    run."""
+    run.
+    """
 
     code: str
     images: int
@@ -87,7 +88,8 @@ class BulkProgress(Queries):
 
     def reasons(self, bulk_id: str) -> list[Reason]:
         """The errors of the first ``MOST_EXPLAINED`` failed images, grouped by error code; the most frequent code
-        first."""
+        first.
+        """
         failed = (BulkItemRow.bulk_id == bulk_id, BulkItemRow.state == ItemState.FAILED)
         code = BulkItemRow.error["code"].as_string().label("code")
         # PostgreSQL groups by a column of a subquery, but not by an expression with a parameter.
@@ -158,7 +160,9 @@ class BulkProgress(Queries):
         return dict(zip(counts, map(int, sums), strict=True))
 
     def image_times(self, limit: int) -> list[tuple[float, float]]:
-        """Estimated and measured time of the newest images that bulk runs deconvolved, s. Only the newest such run is read."""
+        """Estimated and measured time of the newest images that bulk runs deconvolved, s. Only the newest such run is
+        read.
+        """
         newest = select(BulkRow.id).where(BulkRow.done > BulkRow.reused).order_by(BulkRow.created_at.desc())
         query = select(BulkItemRow.statistics).where(
             BulkItemRow.bulk_id == newest.limit(1).scalar_subquery(),

@@ -1,4 +1,5 @@
-"""Bulk runs and their images in the catalogue: create and delete a run, list its files, take images, and store the results.
+"""Bulk runs and their images in the catalogue: create and delete a run, list its files, take images, and store the
+results.
 
 A worker takes an image by compare-and-set under the lease of its job (``workers.bulk.turn``). If the lease is lost,
 another worker can take the image. The counts and the end of a run are written in the transaction that changes its
@@ -136,7 +137,8 @@ class Bulks(Queries):
             if equal is not None:
                 raise DataError(
                     "equal-bulk-open",
-                    f"expected no other open bulk run of the same request; run {equal.id} is {equal.phase}: cancel that run, "
+                    f"expected no other open bulk run of the same request; run {equal.id} is {equal.phase}: cancel "
+                    "that run, "
                     "or try again when it has ended",
                 )
             bulk.phase, bulk.ended_at, bulk.running_since = BulkPhase.RUNNING, None, time.time()
@@ -159,7 +161,9 @@ class Bulks(Queries):
         return True
 
     def _delete_batch(self, bulk: BulkRow) -> bool:
-        """Delete the next images of a cancelled run, or the run if it has no image. Returns whether images were deleted."""
+        """Delete the next images of a cancelled run, or the run if it has no image. Returns whether images were
+        deleted.
+        """
         here = BulkItemRow.bulk_id == bulk.id
         next_ones = select(BulkItemRow.position).where(here).order_by(BulkItemRow.position).limit(BATCH)
         with self._database.writing.begin() as session:
@@ -218,7 +222,8 @@ class Bulks(Queries):
 
     def end_listing(self, bulk_id: str, lease: Lease) -> bool:
         """Let a run whose files are all listed go on, or end if no image is left. Returns False under the conditions of
-        ``add_listed``."""
+        ``add_listed``.
+        """
         with self._database.writing.begin() as session:
             bulk = _listed_by(session, bulk_id, lease)
             if bulk is None:

@@ -1,7 +1,7 @@
 """The catalogue: images, transits, PSFs, products and jobs, in SQLite or PostgreSQL through SQLAlchemy.
 
-Each subject has a class in a separate file. The class ``Catalogue`` has an attribute for each of them, and the operations
-that are common to all content-addressed rows.
+Each subject has a class in a separate file. The class ``Catalogue`` has an attribute for each of them, and the
+operations that are common to all content-addressed rows.
 """
 
 from __future__ import annotations
@@ -99,7 +99,8 @@ class Catalogue:
 
     def clock(self) -> float:
         """The time of the database's clock, in seconds since 1970. Raises ``sqlalchemy.exc.SQLAlchemyError`` if the
-        database does not answer."""
+        database does not answer.
+        """
         return self._database.clock()
 
     def check_writable(self) -> None:
@@ -171,15 +172,16 @@ class Catalogue:
     def delete_draft(self, psf_id: str, owner: str) -> PsfRow:
         """Delete a draft PSF that nothing uses; returns the deleted row.
 
-        Its bytes no longer count for the owner, and a later identical request makes it again. Its files stay in the store.
-        Raises ``DataError`` "no-such-psf", "not-a-draft" or "psf-in-use", and then deletes nothing.
+        Its bytes no longer count for the owner, and a later identical request makes it again. Its files stay in the
+        store. Raises ``DataError`` "no-such-psf", "not-a-draft" or "psf-in-use", and then deletes nothing.
         """
         with self._database.writing.begin() as session:
             row = existing_psf(session, psf_id, owner, lock=True)
             if row.status != PsfStatus.DRAFT:
                 raise DataError(
                     "not-a-draft",
-                    f"expected a draft; PSF {psf_id} is {row.status}, and such PSFs are never deleted: deprecate it instead",
+                    f"expected a draft; PSF {psf_id} is {row.status}, and such PSFs are never deleted: deprecate it "
+                    "instead",
                 )
             _check_unused(session, row)
             session.delete(row)

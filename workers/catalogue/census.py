@@ -134,7 +134,8 @@ class Census(Queries):
 
     def count_untaken(self, older_than_s: float) -> int:
         """Number of queued jobs that are older than ``older_than_s``, and that were given to the broker more than once
-        since they were queued."""
+        since they were queued.
+        """
         return self._database.count(
             JobRow,
             JobRow.phase == Phase.QUEUED,

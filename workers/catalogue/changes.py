@@ -3,8 +3,8 @@
 Each write to a row of these tables sets ``changed_at``, except those that no reader can see, such as a heartbeat. The
 value only grows, and two states of a row never have the same.
 
-A stream makes these queries every half second. Therefore they read times and ids by an index that begins with the owner,
-and at most ``MOST`` rows where nothing else bounds their number. Complete rows are read only after a change.
+A stream makes these queries every half second. Therefore they read times and ids by an index that begins with the
+owner, and at most ``MOST`` rows where nothing else bounds their number. Complete rows are read only after a change.
 """
 
 from __future__ import annotations
@@ -38,7 +38,8 @@ class Changes(Generic[Row]):
         only: ColumnElement[bool] | None = None,
     ) -> None:
         """phases: of rows that have not ended. order: of these rows, before the newest first. only: a condition on the
-        rows that ``open`` and ``since`` find; None: all."""
+        rows that ``open`` and ``since`` find; None: all.
+        """
         self._database, self._order = database, order
         self._table: type[Row] = table
         self._only = true() if only is None else only
@@ -70,7 +71,9 @@ class Changes(Generic[Row]):
 
 
 def changes_of_jobs(database: Database) -> Changes[JobRow]:
-    """The jobs that clients submitted. The turns of bulk runs do not belong to them, nor UWS jobs before their start."""
+    """The jobs that clients submitted. The turns of bulk runs do not belong to them, nor UWS jobs before their
+    start.
+    """
     submitted = sorted(name for name, kind in KINDS.items() if kind.parameters is not None)
     only = JobRow.kind.in_(submitted) & (JobRow.phase != Phase.PENDING)
     # EXECUTING comes before QUEUED, of which there may be very many.

@@ -1,8 +1,8 @@
 """Which PSFs requests use: series whose PSFs may be interpolated, and contexts.
 
-A certified PSF holds in its range of observation times. Between the end of one range and the start of the next, no PSF of
-the series is certified. If the series says so, the PSF of such a time is interpolated between the two PSFs. A context is a
-named, fixed set of PSFs: the same lookup in a context always gives the same PSF.
+A certified PSF holds in its range of observation times. Between the end of one range and the start of the next, no PSF
+of the series is certified. If the series says so, the PSF of such a time is interpolated between the two PSFs. A
+context is a named, fixed set of PSFs: the same lookup in a context always gives the same PSF.
 """
 
 from __future__ import annotations
@@ -74,7 +74,9 @@ class Series(Queries):
     def variants(
         self, instrument: str, channel: str, kind: str, owner: str, context_id: str | None
     ) -> list[str]:
-        """The variants of a channel of which a PSF is certified, or pinned by a context: their channels, such as 174-open_2."""
+        """The variants of a channel of which a PSF is certified, or pinned by a context: their channels, such as
+        174-open_2.
+        """
         table: Any = PsfSeriesRow if context_id is None else PsfPinRow
         start, end = f"{instrument}/{channel}{SEPARATOR}", f"/{kind}"
         certified = exists().where(
@@ -108,7 +110,8 @@ class Series(Queries):
             if series.rpartition("/")[2] != TOTAL:
                 raise DataError(
                     "series-not-total",
-                    f"expected a series of total PSFs (instrument/channel/{TOTAL}), because images are deconvolved with these; "
+                    f"expected a series of total PSFs (instrument/channel/{TOTAL}), because images are deconvolved "
+                    "with these; "
                     f"got {series}: name the series of the total PSFs",
                 )
             if may_interpolate(session, series, owner) == interpolated:
@@ -160,7 +163,8 @@ def _check_known(session: Session, series: str, owner: str) -> None:
     if session.get(PsfSeriesRow, (owner, series)) is None:
         raise DataError(
             "no-such-series",
-            f"expected a series of which a PSF was certified, as instrument/channel/kind; got {series!r:.140}: list the series "
+            f"expected a series of which a PSF was certified, as instrument/channel/kind; got {series!r:.140}: list "
+            "the series "
             "with `heliopsf psf series`, or certify a PSF first",
         )
 
@@ -184,7 +188,8 @@ class Contexts(Queries):
         if not re.fullmatch(NAME, name) or name in RESERVED:
             raise DataError(
                 "bad-name",
-                f"expected a name of up to 63 letters, digits, full stops, underscores and hyphens, other than {' and '.join(RESERVED)}; got "
+                "expected a name of up to 63 letters, digits, full stops, underscores and hyphens, other than "
+                f"{' and '.join(RESERVED)}; got "
                 f"{ascii(name)[:80]}",
             )
         try:
@@ -202,7 +207,8 @@ class Contexts(Queries):
             if existing.id != context.id:
                 raise DataError(
                     "name-taken",
-                    f"expected a name that no other context has; {name} is the context {existing.id} with other PSFs or other series "
+                    f"expected a name that no other context has; {name} is the context {existing.id} with other PSFs "
+                    "or other series "
                     "that may be interpolated, and contexts never change: choose another name",
                 ) from None
             return existing, False
@@ -295,7 +301,8 @@ def _pins_of(session: Session, owner: str, pins: Sequence[Pin]) -> list[PsfPinRo
     if not pins:
         raise DataError(
             "nothing-to-pin",
-            "expected at least one PSF to pin; got an empty list: name PSFs, or leave out the list to pin all certified PSFs",
+            "expected at least one PSF to pin; got an empty list: name PSFs, or leave out the list to pin all "
+            "certified PSFs",
         )
     rows = [_pin(existing_psf(session, pin.psf_id, owner), pin.validity) for pin in pins]
     rows.sort(key=lambda pinned: (pinned.series, pinned.valid_from))
@@ -304,8 +311,10 @@ def _pins_of(session: Session, owner: str, pins: Sequence[Pin]) -> list[PsfPinRo
         if one.series == other.series and first.overlaps(second):
             raise DataError(
                 "ranges-overlap",
-                f"expected at most one PSF of {one.series} for any time; the ranges of PSF {one.psf_id}, {first}, and PSF "
-                f"{other.psf_id}, {second}, overlap: leave one out, or pin it with a narrower range (valid_from, valid_to)",
+                f"expected at most one PSF of {one.series} for any time; the ranges of PSF {one.psf_id}, {first}, and "
+                "PSF "
+                f"{other.psf_id}, {second}, overlap: leave one out, or pin it with a narrower range (valid_from, "
+                "valid_to)",
             )
     return rows
 

@@ -186,7 +186,8 @@ def insert_into(session: Session, table: type[Any]) -> postgresql.Insert | sqlit
 
 def begins_with(column: InstrumentedAttribute[str], digits: str) -> ColumnElement[bool]:
     """The condition that an id begins with these hexadecimal digits. The condition is written so that the database
-    can use an index."""
+    can use an index.
+    """
     return and_(column >= digits, column < digits + "g")
 
 

@@ -221,7 +221,9 @@ class Jobs(Queries):
         return self._database.set(JobRow, _held(lease), **self._again(), **delay)
 
     def cancel(self, job_id: str) -> None:
-        """Abort a pending or queued job, and tell the worker of an executing job to stop. An ended job does not change."""
+        """Abort a pending or queued job, and tell the worker of an executing job to stop. An ended job does not
+        change.
+        """
         at_work = JobRow.phase == Phase.EXECUTING
         self._database.set(
             JobRow,  # one statement, because between two statements the job could be claimed or queued again
@@ -232,8 +234,9 @@ class Jobs(Queries):
         )
 
     def hand_back(self, lease: Lease) -> bool:
-        """Queue an executing job again, because its worker stops. The attempt does not count. Returns False if the lease
-        is lost."""
+        """Queue an executing job again, because its worker stops. The attempt does not count. Returns False if the
+        lease is lost.
+        """
         return self._database.set(
             JobRow,
             [*_held(lease), JobRow.cancel_requested.is_(False)],
@@ -284,11 +287,13 @@ class Jobs(Queries):
     def unsubmitted(
         self, resubmit_s: float, limit: int = 1000, *, idle: bool = False
     ) -> list[tuple[str, Queue]]:
-        """Ids and queues of queued jobs that the broker never received or seems to have lost; sorted by queue, then oldest first.
+        """Ids and queues of queued jobs that the broker never received or seems to have lost; sorted by queue, then
+        oldest first.
 
         A job seems lost when it has waited for ``resubmit_s`` since its submission. This waiting time doubles with each
-        submission, so that the jobs of a long queue are not submitted again and again. idle: there are workers, and they
-        do nothing; then the waiting time does not double, because a message that the broker still had would be taken.
+        submission, so that the jobs of a long queue are not submitted again and again. idle: there are workers, and
+        they do nothing; then the waiting time does not double, because a message that the broker still had would be
+        taken.
         """
         waits = {number: resubmit_s * 2.0 ** max(0, number - 1) for number in range(9)}
         growing_s = case(waits, value=JobRow.submissions, else_=resubmit_s * 2.0**8)
@@ -313,8 +318,9 @@ class Jobs(Queries):
         return self._database.first(query.order_by(JobRow.created_at.desc()))
 
     def reopen(self, job_id: str) -> bool:
-        """Queue a completed job again. The job then has the state of a job that has not run. Returns False if the job is not
-        COMPLETED."""
+        """Queue a completed job again. The job then has the state of a job that has not run. Returns False if the job
+        is not COMPLETED.
+        """
         again = {
             "phase": Phase.QUEUED,
             "result_id": None,
@@ -336,8 +342,8 @@ class Jobs(Queries):
         return self._database.any(select(JobRow.id).where(*waits))
 
     def any_to_do(self, queues: Sequence[Queue], lease_s: float, worker: str) -> bool:
-        """Whether this worker runs a job of these queues, or one waits and could start now, or has lost its worker: that job
-        will wait soon.
+        """Whether this worker runs a job of these queues, or one waits and could start now, or has lost its worker:
+        that job will wait soon.
 
         lease_s: time without a heartbeat after which a worker counts as lost, s.
         """
@@ -399,8 +405,8 @@ def _held(lease: Lease) -> list[Any]:
 class Parts(Queries):
     """The table of parts.
 
-    The row of a part that ``take`` returns is the right to work on it, as it was when it was taken. A worker that has lost
-    this right can still store its result, if no other worker has stored a result of the part.
+    The row of a part that ``take`` returns is the right to work on it, as it was when it was taken. A worker that has
+    lost this right can still store its result, if no other worker has stored a result of the part.
     """
 
     def open(self, owner: str, request_key: str, count: int) -> None:
@@ -411,7 +417,9 @@ class Parts(Queries):
             session.add_all(PartRow(owner=owner, request_key=request_key, number=one) for one in missing)
 
     def take(self, owner: str, request_key: str, lease_s: float) -> PartRow | None:
-        """Take an open part, or a part whose worker has been silent for ``lease_s`` seconds; None if there is no such part."""
+        """Take an open part, or a part whose worker has been silent for ``lease_s`` seconds; None if there is no such
+        part.
+        """
         # A heartbeat in the future was sent before the database's clock was set back; it counts as a heartbeat of now.
         now = self._database.now
         of_job = _of(owner, request_key)

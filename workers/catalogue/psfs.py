@@ -131,9 +131,9 @@ class Psfs(Queries):
 def _query(filters: PsfFilter, owner: str) -> Select[Any]:
     """A query for the PSFs that meet the filters, unsorted.
 
-    A context has few PSFs, and few PSFs are valid at one time. Therefore a subquery finds these PSFs first. The subquery
-    is DISTINCT, because otherwise SQLite reads all PSFs in the order of the list until it finds the PSFs of the
-    context.
+    A context has few PSFs, and few PSFs are valid at one time. Therefore a subquery finds these PSFs first. The
+    subquery is DISTINCT, because otherwise SQLite reads all PSFs in the order of the list until it finds the PSFs of
+    the context.
     """
     query = select(PsfRow).where(PsfRow.owner == owner)
     if filters.context_id is not None:
@@ -232,7 +232,8 @@ def _series(row: PsfRow, change: StatusChange) -> tuple[str, dict[str, Any]]:
         if value is not None and not (name == "channel" and draft and is_variant_of(new, value)):
             raise DataError(
                 "line-known",
-                f"{name}: expected {value!r}, which PSF {row.id} has and which cannot change; got {new!r}: leave it out",
+                f"{name}: expected {value!r}, which PSF {row.id} has and which cannot change; got {new!r}: leave it "
+                "out",
             )
         columns[name] = new
     kind = columns["kind"] or row.kind
@@ -240,7 +241,8 @@ def _series(row: PsfRow, change: StatusChange) -> tuple[str, dict[str, Any]]:
     if series is None:
         raise DataError(
             "no-line",
-            f"expected an instrument, because the file of PSF {row.id} does not name one: give instrument, channel and kind",
+            f"expected an instrument, because the file of PSF {row.id} does not name one: give instrument, channel "
+            "and kind",
         )
     return series, columns | {"kind": kind, "series": series}
 
@@ -253,7 +255,8 @@ def _certify(session: Session, row: PsfRow, columns: dict[str, Any], change: Sta
     elif change.version not in (None, row.version):
         raise DataError(
             "not-of-this-change",
-            f"expected version {row.version}, because the version of a certified PSF cannot change; got {change.version}: "
+            f"expected version {row.version}, because the version of a certified PSF cannot change; got "
+            f"{change.version}: "
             "leave it out",
         )
     validity = change.validity or validity_of(row)
@@ -276,7 +279,8 @@ def _certify(session: Session, row: PsfRow, columns: dict[str, Any], change: Sta
     if other is not None:
         raise DataError(
             "ranges-overlap",
-            f"expected a range that overlaps with no certified PSF of {series}; got {validity}, which overlaps with the range of "
+            f"expected a range that overlaps with no certified PSF of {series}; got {validity}, which overlaps with "
+            "the range of "
             f"PSF {other.id} ({other.name} {other.version}), {validity_of(other)}: deprecate that PSF, name it "
             "in `supersedes`, or change its range first",
         )
@@ -317,7 +321,8 @@ def _deprecate(session: Session, row: PsfRow, change: StatusChange, by: str) -> 
             "successor-named",
             f"expected the successor of the deprecated PSF {row.id}; got none: name a certified PSF of its series"
             if row.successor_id is None
-            else f"expected a deprecated PSF without a successor; PSF {row.id} has successor {row.successor_id}, which cannot change",
+            else f"expected a deprecated PSF without a successor; PSF {row.id} has successor {row.successor_id}, "
+            "which cannot change",
         )
     if change.successor is not None:
         successor = session.get(PsfRow, (row.owner, change.successor))

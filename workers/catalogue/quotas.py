@@ -101,8 +101,10 @@ class Usage:
         """The message for a full quota. why: a clause that says what could not be done."""
         assert self.limit_bytes is not None
         return (
-            f"expected free room in your quota; {self.used_bytes / MIB:.1f} of {self.limit_bytes / MIB:.1f} MiB are used, and "
-            f"{why}: delete products that you no longer need (`heliopsf product delete`), or ask the operator for a larger "
+            f"expected free room in your quota; {self.used_bytes / MIB:.1f} of {self.limit_bytes / MIB:.1f} MiB are "
+            "used, and "
+            f"{why}: delete products that you no longer need (`heliopsf product delete`), or ask the operator for a "
+            "larger "
             "quota"
         )
 
@@ -129,7 +131,9 @@ class Quotas(Queries):
             return _limited(session, owner, quota_mib)
 
     def all(self, quota_mib: int) -> list[Usage]:
-        """The usage of all owners who keep files, made a key or have an individual limit. quota_mib: as for ``usage``."""
+        """The usage of all owners who keep files, made a key or have an individual limit. quota_mib: as for
+        ``usage``.
+        """
         with self._database.reading() as session:
             tables: tuple[Any, ...] = (OwnerRow, *WITH_FILES)
             owners = {name for row in tables for name in session.scalars(select(row.owner).distinct())}

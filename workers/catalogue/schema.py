@@ -1,7 +1,7 @@
 """Compare the revision of the database with the revision that this version of heliopsf needs, and upgrade the database.
 
-A revision is a numbered state of the tables. The revisions are in ``workers/catalogue/migrations/versions``. Alembic runs
-them; it is imported only when needed. A new database gets the present tables at once, without running revisions.
+A revision is a numbered state of the tables. The revisions are in ``workers/catalogue/migrations/versions``. Alembic
+runs them; it is imported only when needed. A new database gets the present tables at once, without running revisions.
 
 Any number of processes may start at the same moment. The first process that gets the lock of the database makes or
 upgrades the tables in one transaction. The others wait, and then find that it is upgraded.
@@ -62,12 +62,14 @@ class SchemaStatus:
             case "obsolete":
                 return (
                     f"the database is at revision {self.revision} of a development version, which heliopsf "
-                    f"{software_version()} cannot upgrade: upgrade it first with the last version that can (see Upgrading "
+                    f"{software_version()} cannot upgrade: upgrade it first with the last version that can (see "
+                    "Upgrading "
                     "in docs/operating.md), or use an empty database"
                 )
             case "unversioned":
                 return (
-                    "expected an empty database or one of heliopsf; this one has tables with names of heliopsf's tables, but "
+                    "expected an empty database or one of heliopsf; this one has tables with names of heliopsf's "
+                    "tables, but "
                     "without a revision: use an empty database"
                 )
         return None
@@ -135,7 +137,8 @@ class Schema:
         if status.state != "current":
             there = "empty" if status.state == "empty" else f"at revision {status.revision}"
             raise SchemaError(
-                f"expected a database at revision {status.wanted}, which heliopsf {software_version()} needs; it is {there}: "
+                f"expected a database at revision {status.wanted}, which heliopsf {software_version()} needs; it is "
+                f"{there}: "
                 "upgrade it with `heliopsf database upgrade`, or start a server of this version"
             )
 

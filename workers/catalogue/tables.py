@@ -309,7 +309,8 @@ class JobRow(RunColumns, Base):
     estimate: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
 
     __table_args__ = (
-        # If two identical requests arrive at the same moment, the second insert fails; the request then finds the first job.
+        # If two identical requests arrive at the same moment, the second insert fails; the request then finds the first
+        # job.
         _partial("one_live_job_a_request", _LIVE, "owner", "request_key", unique=True),
         # If two jobs have the same result, the second cannot be claimed while the first executes.
         _partial("one_at_work_a_result", _EXECUTING, "owner", "work_key", unique=True),
@@ -351,7 +352,8 @@ class BulkRow(RunColumns, Base):
     lister: Mapped[str | None] = mapped_column(
         String(32)
     )  # token of the lease of the worker that lists files
-    # how far the files are listed (``workers.bulk.listing.SearchPosition``); null: the listing has not begun, or it has no files
+    # how far the files are listed (``workers.bulk.listing.SearchPosition``); null: the listing has not begun, or it has
+    # no files
     listed_to: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
     total: Mapped[int] = mapped_column(default=0)
     done: Mapped[int] = mapped_column(default=0)
@@ -362,7 +364,8 @@ class BulkRow(RunColumns, Base):
         _listed("bulks"),
         Index("bulks_by_phase", "phase"),
         Index("bulks_changed", "owner", "changed_at", "id"),
-        # If two identical requests arrive at the same moment, the second insert fails; the request then finds the first run.
+        # If two identical requests arrive at the same moment, the second insert fails; the request then finds the first
+        # run.
         _partial("one_open_bulk_a_request", _OPEN, "owner", "request_key", unique=True),
     )
 

@@ -23,7 +23,8 @@ from workers.catalogue.tables import JobRow, OwnerTurnRow
 from workers.contract.jobs import Phase, Queue
 
 MOST_COUNTED = 1000
-MOST_READ = 10_000  # at most this number of waiting jobs of a queue is read, oldest first, to count the jobs of each owner
+# at most this number of waiting jobs of a queue is read, oldest first, to count the jobs of each owner
+MOST_READ = 10_000
 
 
 class Turns:
@@ -110,7 +111,8 @@ class Places(Queries):
 
     def before(self, job: JobRow) -> int | None:
         """The number of waiting jobs that are expected to start before a job, at most MOST_COUNTED; None if the job
-        is not QUEUED."""
+        is not QUEUED.
+        """
         if job.phase != Phase.QUEUED:
             return None
         began = job.created_at if job.started_at is None else job.started_at

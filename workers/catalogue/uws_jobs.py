@@ -115,7 +115,9 @@ class UwsJobs:
                 session.merge(TermsRow(job_id=job_id, **values))
 
     def end_by_terms(self) -> list[str]:
-        """Stop jobs that exceed their time limit; destroy jobs whose destruction time has come, and return their ids."""
+        """Stop jobs that exceed their time limit; destroy jobs whose destruction time has come, and return their
+        ids.
+        """
         now = self._database.now
         too_long = select(JobRow.id).join(TermsRow, TermsRow.job_id == JobRow.id)
         too_long = too_long.where(

@@ -106,7 +106,8 @@ class FileSet(_Strict):
     )
     where: Where = Field(
         default_factory=dict,
-        description='conditions on the header, for example {"INSTRUME": "EUI", "WAVELNTH": [171, 174], "XPOSURE": {">=": 1}}',
+        description='conditions on the header, for example {"INSTRUME": "EUI", "WAVELNTH": [171, 174], "XPOSURE": '
+        '{">=": 1}}',
     )
 
 
@@ -122,7 +123,8 @@ class Output(_Strict):
     layout: str | None = Field(
         None,
         max_length=300,
-        description="relative path of each product in the folder, for example {telescop}/{date:%Y/%m/%d}/{stem}_deconvolved.fits; "
+        description="relative path of each product in the folder, for example "
+        "{telescop}/{date:%Y/%m/%d}/{stem}_deconvolved.fits; "
         f"fields: {', '.join(FIELDS)}; an existing file with other content is never replaced; null: STEM-PRODUCT.fits",
     )
 
@@ -146,7 +148,7 @@ class BulkWork(_Strict):
         max_length=64,
         description="id or name of the context from which the PSF of each image is chosen",
     )
-    parameters: Treatment = Field(default_factory=lambda: Treatment())
+    parameters: Treatment = Field(default_factory=lambda: Treatment())  # noqa: PLW0108  # pydantic calls it later
     output: Output | None = None
 
     @property
@@ -175,9 +177,9 @@ class BulkRequest(BulkWork):
 
 # Layouts --------------------------------------------------------------------------------------------
 #
-# A layout is a relative path with fields in braces, such as {telescop}/{date:%Y/%m/%d}/{stem}_deconvolved.fits. Values of
-# headers and file names become parts of names: all characters except letters, digits, full stops, underscores and hyphens
-# are replaced. Therefore no value can lead out of the output folder.
+# A layout is a relative path with fields in braces, such as {telescop}/{date:%Y/%m/%d}/{stem}_deconvolved.fits. Values
+# of headers and file names become parts of names: all characters except letters, digits, full stops, underscores and
+# hyphens are replaced. Therefore no value can lead out of the output folder.
 
 
 def check_layout(layout: str) -> None:

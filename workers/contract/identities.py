@@ -106,10 +106,12 @@ _ALWAYS_HASHED = (
 
 
 def product_identity(request: ResolvedDeconvolve) -> str:
-    """The identity of a deconvolved image: the hash of the input, the PSF, the method and its parameters, and the versions of algorithm and file."""
-    # The id of the PSF determines the PSF. The recipe and the interpolation only say how to make the PSF, and the context
-    # where it was found. `again` only permits a second deconvolution; the image itself determines whether this deconvolution
-    # is a second one.
+    """The identity of a deconvolved image: the hash of the input, the PSF, the method and its parameters, and the
+    versions of algorithm and file.
+    """
+    # The id of the PSF determines the PSF. The recipe and the interpolation only say how to make the PSF, and the
+    # context where it was found. `again` only permits a second deconvolution; the image itself determines whether this
+    # deconvolution is a second one.
     excluded = {"psf_recipe", "psf_interpolation", "context_id", "again"}
     # A field that is not given leaves the identities as they were before there was this field.
     fields = type(request).model_fields
@@ -132,18 +134,23 @@ def product_identity(request: ResolvedDeconvolve) -> str:
 
 
 def psf_fit_identity(request: ResolvedPsfFit | ResolvedCrossValidate) -> str:
-    """The identity of a fit or a cross-validation: the hash of the transit, the parameters, the diffraction PSF and the version of the algorithm."""
+    """The identity of a fit or a cross-validation: the hash of the transit, the parameters, the diffraction PSF and the
+    version of the algorithm.
+    """
     return _transit_identity("psf-fit" if isinstance(request, ResolvedPsfFit) else "cross-validate", request)
 
 
 def report_identity(request: ResolvedReport) -> str:
-    """The identity of a report: the hash of the transit, the parameters, the PSF or diffraction PSF, and the algorithm version."""
+    """The identity of a report: the hash of the transit, the parameters, the PSF or diffraction PSF, and the algorithm
+    version.
+    """
     return _transit_identity("report", request)
 
 
 def gap_identity(request: ResolvedGapDiagnose) -> str:
     """The identity of a diagnosis: the hash of the transit, the parameters, the PSFs, the source text of the library of
-    effects, and the version of the algorithm."""
+    effects, and the version of the algorithm.
+    """
     # Diagnoses without added effects keep the ids that they had before the texts of added effects were hashed.
     excluded = () if request.added_effects_sha256 else ("added_effects_sha256",)
     return _transit_identity("gap-diagnose", request, excluded, library=library_sha256())
@@ -151,7 +158,8 @@ def gap_identity(request: ResolvedGapDiagnose) -> str:
 
 def diffraction_identity(request: ResolvedOnTransit) -> str | None:
     """The identity of the diffraction PSF that the job has to build; None if the transit contains a known PSF or the
-    request names a PSF."""
+    request names a PSF.
+    """
     return None if request.diffraction_recipe is None else psf_identity(request.diffraction_recipe)
 
 

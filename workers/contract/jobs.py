@@ -70,7 +70,9 @@ class Queue(StrEnum):
 
 
 def queues_named(names: str) -> tuple[Queue, ...]:
-    """The queues in a text such as ``interactive,bulk``, highest priority first; ValueError if the text names an unknown queue."""
+    """The queues in a text such as ``interactive,bulk``, highest priority first; ValueError if the text names an
+    unknown queue.
+    """
     wanted = {name.strip() for name in names.split(",") if name.strip()}
     if not wanted or wanted - set(Queue):
         raise ValueError(f"expected queues of {', '.join(Queue)}, separated by commas; got {names!r}")

@@ -1,7 +1,8 @@
 """The table of job kinds, with one row for each kind. All code that depends on the kind of a job reads this table.
 
-To add a kind, write its parameters in ``workers.contract.requests``, a row here, a task in ``workers/tasks``, and a test.
-The web process imports this module. Therefore a row contains only the name of its task, and only workers import the task.
+To add a kind, write its parameters in ``workers.contract.requests``, a row here, a task in ``workers/tasks``, and a
+test. The web process imports this module. Therefore a row contains only the name of its task, and only workers import
+the task.
 """
 
 from __future__ import annotations
@@ -75,14 +76,14 @@ class Kind:
     |---|---|
     | task, assistant | dotted names of functions; other workers run the assistant when a job asks for help |
     | result | type of the result |
-    | parameters, resolved | models of the parameters: as the client sends them, and as the worker gets them; None: clients cannot request this kind |
-    | identity | function from the resolved parameters to the identity of the result; None: every job makes a new result |
-    | resolver | dotted name of the function that resolves the parameters; the default checks the ids and adds the recipe of the diffraction PSF |
+    | parameters, resolved | models of the parameters as clients send and workers get them; None: not for clients |
+    | identity | from the resolved parameters to the identity of the result; None: every job makes a new one |
+    | resolver | dotted name of the function that resolves the parameters; default: by their ids |
     | queue | the queue in which jobs of this kind wait by default |
-    | origin | the origin of the PSFs or products that this kind makes; a rerun finds the kind of its job by this origin |
+    | origin | the origin of the PSFs or products of this kind; by it a rerun finds the kind |
     | needs_room | whether the job starts only if the owner's quota is not full |
     | counted_whole | whether the reported steps count the whole job, so that the time left can be estimated from them |
-    | memory_advice, time_advice | advice for a request that needs more than the limits of the operator; time_advice: None if it is the same |
+    | memory_advice, time_advice | advice for a request that exceeds the limits; time_advice: None if it is the same |
     """
 
     name: str

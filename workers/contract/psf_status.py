@@ -40,7 +40,8 @@ class TimeRange(BaseModel):
 
 class StatusChange(TimeRange):
     """A change of a PSF's status: certify a draft, change the range of a certified PSF, or deprecate a certified
-    PSF."""
+    PSF.
+    """
 
     status: PsfStatus
     reason: Reason = ""
@@ -60,7 +61,8 @@ class StatusChange(TimeRange):
     instrument: Word | None = Field(None, description="for a draft whose file names no instrument")
     channel: Word | None = Field(
         None,
-        description="for a draft whose file names no wavelength; or a variant of its channel for one filter (card FILTER) or plate "
+        description="for a draft whose file names no wavelength; or a variant of its channel for one filter (card "
+        "FILTER) or plate "
         "scale, such as `174-open_2` or `174-0.984arcsec`",
     )
     kind: Word | None = Field(None, description="for an uploaded draft, such as `total`")

@@ -1,8 +1,8 @@
 """Parameters of every job kind: as a client sends them, and (``Resolved...``) as the worker gets them.
 
 The web process and the workers both import this module, so it must not load numerical libraries.
-``workers.contract.kinds`` makes the requests from these models. The parameters of a method of deconvolution are those that its
-file in ``psfcore/deconvolve/methods`` declares.
+``workers.contract.kinds`` makes the requests from these models. The parameters of a method of deconvolution are those
+that its file in ``psfcore/deconvolve/methods`` declares.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 class Option:
     """How a command names a field of a request, as metadata of its annotation; `service.cli.options` makes the option.
 
-    name: such as "--saturation"; None: the name of the field. metavar: the placeholder of the value. check: raises DataError
-    for a text that is no value.
+    name: such as "--saturation"; None: the name of the field. metavar: the placeholder of the value. check: raises
+    DataError for a text that is no value.
     """
 
     name: str | None = None
@@ -78,7 +78,8 @@ ShapeName = Literal[
 
 
 class Parameters(BaseModel):
-    """Base class of the parameters of a job, or of a part of a job. Unknown names are refused; values cannot be changed afterwards.
+    """Base class of the parameters of a job, or of a part of a job. Unknown names are refused; values cannot be changed
+    afterwards.
 
     algorithm_version: raise it when the same parameters give another result; it is part of the identity of the result.
     """
@@ -104,7 +105,8 @@ class _Method(Parameters):
         None,
         ge=0,
         le=4096,
-        description="width of the margin around the field of view in which the scene is also estimated; null: derived from the PSF",
+        description="width of the margin around the field of view in which the scene is also estimated; null: derived "
+        "from the PSF",
     )
 
 
@@ -198,7 +200,8 @@ class Deconvolve(Treatment):
     image_id: Identity = Field(description="id returned by the upload of the image")
     psf_id: Identity | None = Field(
         None,
-        description="id of a PSF of the catalogue; null: the certified PSF that fits the image, else the PSF built from "
+        description="id of a PSF of the catalogue; null: the certified PSF that fits the image, else the PSF built "
+        "from "
         "the instrument file",
     )
     context: ContextName | None = Field(
@@ -242,7 +245,9 @@ class Deconvolve(Treatment):
 
 
 class PsfFit(Parameters):
-    """Fit the diffuse scatter to an uploaded transit. The result is a PSF version with the errors of the fit, its curves and a report."""
+    """Fit the diffuse scatter to an uploaded transit. The result is a PSF version with the errors of the fit, its
+    curves and a report.
+    """
 
     algorithm_version: ClassVar[int] = 1
     transit_id: TransitId
@@ -268,7 +273,8 @@ class CrossValidate(PsfFit):
     as_published: Literal[False] = False
     scheme: Literal["shared", "exact"] = Field(
         "shared",
-        description="`shared`: all folds use the same reconstructions; `exact`: each fold makes its own reconstructions "
+        description="`shared`: all folds use the same reconstructions; `exact`: each fold makes its own "
+        "reconstructions "
         "(slow; several workers share the folds)",
     )
     runs: int = Field(
@@ -311,8 +317,9 @@ class Report(Parameters):
 
 
 class GapDiagnose(Parameters):
-    """Diagnose the gap between an uploaded transit and the model that was fitted to it. The report says how large the gap is,
-    where in the data it appears, and which effects explain it."""
+    """Diagnose the gap between an uploaded transit and the model that was fitted to it. The report says how large the
+    gap is, where in the data it appears, and which effects explain it.
+    """
 
     algorithm_version: ClassVar[int] = 18
     transit_id: TransitId
@@ -327,11 +334,13 @@ class GapDiagnose(Parameters):
         0.9,
         ge=0.5,
         le=0.95,
-        description="probability of the alternatives of each cause together: with a larger one more alternatives are told",
+        description="probability of the alternatives of each cause together: with a larger one more alternatives are "
+        "told",
     )
     correct: bool = Field(
         True,
-        description="if the diagnosis finds an effect, also add a corrected PSF to the catalogue: a fit with this effect in the model",
+        description="if the diagnosis finds an effect, also add a corrected PSF to the catalogue: a fit with this "
+        "effect in the model",
     )
 
 
@@ -351,12 +360,15 @@ Time = Annotated[
 
 
 class PsfInterpolate(Parameters):
-    """Interpolate between two fitted PSFs in time. The result is a PSF version with its errors. Nothing is extrapolated."""
+    """Interpolate between two fitted PSFs in time. The result is a PSF version with its errors. Nothing is
+    extrapolated.
+    """
 
     algorithm_version: ClassVar[int] = 1
     before_psf_id: Identity = Field(description="id of the earlier PSF")
     before_time: Time = Field(
-        description="the last time at which the earlier PSF holds, such as 2024-03-01T12:00:00Z; a time without a zone is UTC"
+        description="the last time at which the earlier PSF holds, such as 2024-03-01T12:00:00Z; a time without a "
+        "zone is UTC"
     )
     after_psf_id: Identity = Field(description="id of the later PSF, which was fitted with the same shape")
     after_time: Time = Field(description="the first time at which the later PSF holds")
@@ -372,7 +384,8 @@ class PsfInterpolate(Parameters):
             )
         if not before <= at <= after:
             raise ValueError(
-                f"time: expected a time from {self.before_time} to {self.after_time}, because PSFs are not extrapolated; got "
+                f"time: expected a time from {self.before_time} to {self.after_time}, because PSFs are not "
+                "extrapolated; got "
                 f"{self.time}: name PSFs whose times enclose it"
             )
         return self
@@ -386,7 +399,9 @@ class PsfTables(Parameters):
 
 
 class Rerun(Parameters):
-    """Make a product or a PSF again with the same parameters, and compare it with the first one. Existing results do not change."""
+    """Make a product or a PSF again with the same parameters, and compare it with the first one. Existing results do
+    not change.
+    """
 
     of: Literal["product", "psf"] = Field(description="type of the result to make again")
     id: Identity = Field(description="id of the product or PSF; an uploaded PSF cannot be made again")
@@ -394,7 +409,8 @@ class Rerun(Parameters):
 
 class ResolvedDeconvolve(Deconvolve):
     """A deconvolution with the id of its PSF. If the PSF may still have to be built or interpolated, the parameters
-    also say how."""
+    also say how.
+    """
 
     psf_id: Identity
     context: None = Field(None, exclude=True)  # the PSF is chosen; context_id says from which context
@@ -405,7 +421,9 @@ class ResolvedDeconvolve(Deconvolve):
 
 
 class WithDiffraction(Parameters):
-    """A job on a transit: the recipe of the diffraction PSF, if the job needs this PSF and the transit does not contain it."""
+    """A job on a transit: the recipe of the diffraction PSF, if the job needs this PSF and the transit does not contain
+    it.
+    """
 
     diffraction_recipe: PsfBuild | None = None
 

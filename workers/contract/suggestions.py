@@ -50,7 +50,9 @@ def _members(kind: Any) -> list[type[BaseModel]]:
 
 
 def _at(kind: Any, location: Iterable[str | int]) -> Any:
-    """The type at a location. A location consists of field names, list indices, and the tags that select a member of a union."""
+    """The type at a location. A location consists of field names, list indices, and the tags that select a member of a
+    union.
+    """
     for step in location:
         if isinstance(step, int):  # an index of a list
             continue

@@ -3,8 +3,8 @@
 The symbolic links in the path of a request are resolved first. The resolved path must lie below a folder that the
 operator allows. Every file that a pattern matches is checked in the same way.
 
-After the check, a file is opened safely even if somebody changes a link meanwhile: its path is opened part by part, from
-the allowed folder downwards, and no part may be a link. If somebody replaces a part by a link after the check, the
+After the check, a file is opened safely even if somebody changes a link meanwhile: its path is opened part by part,
+from the allowed folder downwards, and no part may be a link. If somebody replaces a part by a link after the check, the
 operating system refuses to open it. A file is written and renamed inside the opened folder, not by its path.
 """
 
@@ -98,8 +98,8 @@ def find(glob: str, allowed: Sequence[Path], after: Position | None = None) -> I
     """Find the files that a pattern matches, and yield every folder and entry at which the search looks, each once.
 
     The entries of a folder are sorted by name; those of its subfolders follow. Links that lead out of the allowed
-    folders are not followed. after: continue a search that ended after this position; what was added or removed before it
-    since then is not noticed. Raises DataError "bad-path", "path-not-allowed", "unreadable-folder".
+    folders are not followed. after: continue a search that ended after this position; what was added or removed before
+    it since then is not noticed. Raises DataError "bad-path", "path-not-allowed", "unreadable-folder".
     """
     folder, parts = _split(glob)
     return _walk(check_under(folder, allowed), parts, allowed, after)
@@ -123,7 +123,8 @@ def copy_hashed(file: BinaryIO, target: Path, max_bytes: int) -> str:
             if size > max_bytes:
                 raise DataError(
                     "too-large",
-                    f"expected a file of at most {max_bytes} bytes; got a larger one: ask the operator for a higher limit",
+                    f"expected a file of at most {max_bytes} bytes; got a larger one: ask the operator for a higher "
+                    "limit",
                 )
             digest.update(chunk)
             copy.write(chunk)
@@ -144,7 +145,7 @@ def stem_of(name: str) -> str:
 
 
 def shown(path: PurePath) -> str:
-    """A path as valid UTF-8 text. A byte that is not UTF-8 is written in the form \\xff."""
+    r"""A path as valid UTF-8 text. A byte that is not UTF-8 is written in the form \xff."""
     return str(path).encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
 
 
@@ -200,7 +201,8 @@ def _walk(
 
 def _is_after(position: Position, after: Position | None) -> bool:
     """Whether a search looks at a position later than at ``after``: folders come in the order of their names, and the
-    entries of a folder come before those of its subfolders."""
+    entries of a folder come before those of its subfolders.
+    """
     return after is None or (position[:-1], position[-1]) > (after[:-1], after[-1])
 
 
@@ -323,8 +325,8 @@ def make_folder(folder: Path, allowed: Sequence[Path]) -> None:
 def put(source: Path, target: Path, allowed: Sequence[Path], *, replace: bool = True) -> None:
     """Copy a file to a path below an allowed folder in one step: a reader sees either the whole file or no file.
 
-    replace: whether an existing file is replaced. Raises the same DataErrors as ``opened``, and OSError; FileExistsError if
-    there is a file that must not be replaced, even if another process writes it at the same moment.
+    replace: whether an existing file is replaced. Raises the same DataErrors as ``opened``, and OSError;
+    FileExistsError if there is a file that must not be replaced, even if another process writes it at the same moment.
     """
     with source.open("rb") as file, _folder(target.parent, allowed, make=True) as folder:
         partial = f".{target.name}.{uuid.uuid4().hex}{PARTIAL}"

@@ -1,9 +1,9 @@
 """The files to which the rows of the catalogue refer: check that the store has them, and remove all other files.
 
-A job leaves a file without a row if it is killed before it adds its row. Recent files are not removed, because an upload
-first stores its file and then adds the row that refers to it. An upload may also store a file again while the collection
-removes it, and add the row a little later. Therefore the rows are read a second time before a file is deleted for good:
-``settle`` is the only place that deletes files of the store.
+A job leaves a file without a row if it is killed before it adds its row. Recent files are not removed, because an
+upload first stores its file and then adds the row that refers to it. An upload may also store a file again while the
+collection removes it, and add the row a little later. Therefore the rows are read a second time before a file is
+deleted for good: ``settle`` is the only place that deletes files of the store.
 
 Kept solutions of transits can be made again, so old ones are removed too, with their rows. The same age limit applies.
 ``retain`` deletes what is older than the operator keeps it, with its files. PSFs and contexts are always kept.
@@ -64,7 +64,9 @@ def intact(store: Store, row: FileRow) -> bool:
 
 
 def intact_row(catalogue: Catalogue, store: Store, table: type[Row], identity: str, owner: str) -> Row | None:
-    """The row of a result with this identity; None if there is none, or if one of its files is lost. Raises ``StoreAway``."""
+    """The row of a result with this identity; None if there is none, or if one of its files is lost. Raises
+    ``StoreAway``.
+    """
     row = catalogue.get(table, identity, owner)
     return row if row is not None and intact(store, row) else None
 
@@ -126,8 +128,8 @@ def collect(
     solution, refers to them.
 
     Run only one collection at a time. Raises DataError "nothing-named" if no row refers to any file of the store: the
-    database then probably belongs to another store. Raises DataError "most-unnamed" if more than half of the files would
-    be removed and ``even_most`` is False, because killed jobs rarely leave so many files.
+    database then probably belongs to another store. Raises DataError "most-unnamed" if more than half of the files
+    would be removed and ``even_most`` is False, because killed jobs rarely leave so many files.
     """
     kept_before = time.time() - older_than_s
     there = {blob.digest: blob for blob in store.blobs()}
@@ -138,7 +140,8 @@ def collect(
     if there and len(left) == len(there):
         raise DataError(
             "nothing-named",
-            f"expected a database that refers to some of the {len(there)} files of the store; this one refers to none of them: check "
+            f"expected a database that refers to some of the {len(there)} files of the store; this one refers to none "
+            "of them: check "
             "that the settings name the right database",
         )
     old = [blob for blob in left.values() if blob.kept_at < kept_before]
@@ -147,8 +150,10 @@ def collect(
     if not dry_run and not even_most and 2 * len(lost) > len(there):
         raise DataError(
             "most-unnamed",
-            f"expected a database that refers to most of the {len(there)} files of the store; this one does not refer to "
-            f"{len(lost)} old files: check that the settings name the right database. Nothing was removed; to remove them "
+            f"expected a database that refers to most of the {len(there)} files of the store; this one does not refer "
+            "to "
+            f"{len(lost)} old files: check that the settings name the right database. Nothing was removed; to remove "
+            "them "
             "all, add --even-most",
         )
     if not dry_run:
@@ -175,7 +180,8 @@ def settle(catalogue: Catalogue, store: Store, digests: set[str]) -> set[str]:
     """Bring back those of the files moved aside to which a row refers, and delete the others.
 
     A file to which a row refers is deleted aside only after the store shows it in its place. Returns the hashes of the
-    files that were brought back. If this is interrupted, the next call finds the files that are left. Raises ``StoreAway``.
+    files that were brought back. If this is interrupted, the next call finds the files that are left. Raises
+    ``StoreAway``.
     """
     if not digests:
         return set()
@@ -213,7 +219,8 @@ def _removed(
 
 
 def retain(catalogue: Catalogue, store: Store, settings: Settings) -> dict[tuple[str, str], list[int]]:
-    """Delete what is older than ``settings.kept_days`` allows, and log it. In a dry run, only log what would be deleted.
+    """Delete what is older than ``settings.kept_days`` allows, and log it. In a dry run, only log what would be
+    deleted.
 
     Returns the bytes of each deleted thing, by owner and kind.
     """

@@ -71,6 +71,8 @@ def open_file(file: BinaryIO) -> None:
 
 
 def open_made_folder(name: str, parent: int) -> None:
-    """Give a folder that was just made in an opened folder the permissions that the operator's umask gives. Raises OSError."""
+    """Give a folder that was just made in an opened folder the permissions that the operator's umask gives. Raises
+    OSError.
+    """
     if _operators_umask is not None:
         os.chmod(name, _opened_mode(0o777), dir_fd=parent)

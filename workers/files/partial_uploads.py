@@ -28,8 +28,8 @@ MOST_OPEN = 20  # open uploads of one owner
 class PartialUpload:
     """An upload that is not complete yet.
 
-    kind: "transit" or "image". length: size of the whole file, bytes. sha256: the SHA-256 that the client declares for the
-    whole file, in hexadecimal; None if it declares none.
+    kind: "transit" or "image". length: size of the whole file, bytes. sha256: the SHA-256 that the client declares for
+    the whole file, in hexadecimal; None if it declares none.
     """
 
     id: str
@@ -105,14 +105,16 @@ class PartialUploads:
     @contextmanager
     def opened(self, upload: PartialUpload) -> Iterator[BinaryIO]:
         """The file with the bytes received so far, for appending. Raises DataError "upload-locked" if another request
-        appends to it, and FileNotFoundError as ``offset`` does."""
+        appends to it, and FileNotFoundError as ``offset`` does.
+        """
         with self.path(upload).open("r+b") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 raise DataError(
                     "upload-locked",
-                    "expected one request at a time for an upload; another request sends bytes now: ask for its offset, "
+                    "expected one request at a time for an upload; another request sends bytes now: ask for its "
+                    "offset, "
                     "then try again",
                 ) from None
             file.seek(0, os.SEEK_END)

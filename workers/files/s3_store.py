@@ -41,8 +41,8 @@ SILENT = (ReadTimeoutError, ConnectTimeoutError, TimeoutError)
 class Patience:
     """How long a call waits for the store.
 
-    silence_s: longest time until the next byte of an answer. tries: how many times a request is sent if it fails. pause_s:
-    after a call that got no answer, all calls fail at once for this time.
+    silence_s: longest time until the next byte of an answer. tries: how many times a request is sent if it fails.
+    pause_s: after a call that got no answer, all calls fail at once for this time.
     """
 
     silence_s: float
@@ -50,13 +50,16 @@ class Patience:
     pause_s: float
 
 
-# The calls of a worker must end long before ``garbage.SETTLED_AFTER_S``: until then, a file that was moved aside can come back.
+# The calls of a worker must end long before ``garbage.SETTLED_AFTER_S``: until then, a file that was moved aside can
+# come back.
 WORKER = Patience(silence_s=30.0, tries=3, pause_s=0.0)
 REQUEST = Patience(silence_s=10.0, tries=2, pause_s=5.0)
 
 
 def _is_worth_repeating(error: Exception) -> bool:
-    """Whether to repeat a request, beside the errors for which s3fs does so itself: silence and answers that were cut."""
+    """Whether to repeat a request, beside the errors for which s3fs does so itself: silence and answers that were
+    cut.
+    """
     if isinstance(error, ClientError):
         return bool(error.response.get("ResponseMetadata", {}).get("HTTPStatusCode", 0) >= 500)
     return isinstance(error, NotConnected)
@@ -66,7 +69,9 @@ set_custom_error_handler(_is_worth_repeating)
 
 
 class RemoteStore(Store):
-    """Objects below a prefix of a bucket, named by the hash of their content. Readers get copies in the local folder."""
+    """Objects below a prefix of a bucket, named by the hash of their content. Readers get copies in the local
+    folder.
+    """
 
     def __init__(
         self, url: str, folder: Path, max_copies_bytes: int, *, within_requests: bool = False
@@ -77,8 +82,8 @@ class RemoteStore(Store):
         self._counted_at = 0.0
         self._patience = REQUEST if within_requests else WORKER
         self._silent_until = -math.inf
-        # Listings are not cached, because objects of other processes must be visible at once. s3fs repeats requests, and
-        # downloads from where they were cut; if botocore repeated them too, the numbers of tries would multiply.
+        # Listings are not cached, because objects of other processes must be visible at once. s3fs repeats requests,
+        # and downloads from where they were cut; if botocore repeated them too, the numbers of tries would multiply.
         self._s3: Any = s3fs.S3FileSystem(
             use_listings_cache=False,
             skip_instance_cache=True,
@@ -91,7 +96,9 @@ class RemoteStore(Store):
         self._s3.retries = self._patience.tries
 
     def path(self, digest: str) -> Path:
-        """A local copy of the file with this SHA-256, downloaded if missing. Raises ``StoreAway``, FileNotFoundError."""
+        """A local copy of the file with this SHA-256, downloaded if missing. Raises ``StoreAway``,
+        FileNotFoundError.
+        """
         copy = self._place(digest)
         try:
             os.utime(copy)
@@ -185,7 +192,8 @@ class RemoteStore(Store):
     def aside(self, before: float = math.inf) -> set[str]:
         """As ``Store.aside``. Raises ``StoreAway``."""
         with self._answering():
-            # With a prefix, s3fs does not take the folder for an object if a file is moved there just after an empty listing.
+            # With a prefix, s3fs does not take the folder for an object if a file is moved there just after an empty
+            # listing.
             found = self._s3.find(self._root, prefix="aside/", detail=True)
         return {blob.digest for blob in map(_blob_of, found.values()) if blob.kept_at < before}
 
@@ -216,7 +224,9 @@ class RemoteStore(Store):
         return True
 
     def _listed(self, key: str) -> Blob | None:
-        """Size and time of an object as a listing of the bucket shows them; None if it is absent. Raises ``StoreAway``."""
+        """Size and time of an object as a listing of the bucket shows them; None if it is absent. Raises
+        ``StoreAway``.
+        """
         bucket, _, name = key.partition("/")
         with self._answering():
             listed = self._s3.call_s3("list_objects_v2", Bucket=bucket, Prefix=name, MaxKeys=1)

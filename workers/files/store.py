@@ -33,12 +33,16 @@ from psfcore.transit.archive import unpack
 from workers.settings import Settings
 
 ADVICE = (
-    "if it was uploaded, upload it again; if a job made it, submit the same request again, and the job makes it again; if "
+    "if it was uploaded, upload it again; if a job made it, submit the same request again, and the job makes it "
+    "again; if "
     "this does not help, tell the operator, who finds such files with `heliopsf store check`"
 )
 DAMAGED = f"its content has changed on the disk: {ADVICE}"
 STORAGE_FULL = "storage-full"  # the code of such an error
-NO_ROOM = "expected free space on the disk of the service; the disk is full: ask the operator to make room, then try again"
+NO_ROOM = (
+    "expected free space on the disk of the service; the disk is full: ask the operator to make room, then try "
+    "again"
+)
 _FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 
 
@@ -127,7 +131,8 @@ class Store:
             return None
 
     def state(self, digest: str, size: int | None, *, content: bool) -> FileState:
-        """Whether the file with this SHA-256 is good, lost or damaged. size: its recorded size, bytes; None: not recorded.
+        """Whether the file with this SHA-256 is good, lost or damaged. size: its recorded size, bytes; None: not
+        recorded.
 
         content: also read the file and compare its SHA-256.
         """
@@ -200,7 +205,9 @@ class Store:
 
     @contextmanager
     def unpacked(self, digest: str, limits: ArchiveLimits) -> Iterator[Path]:
-        """Unpack a stored archive into a folder that is removed at the end. Raises ``BadFile`` and the errors of ``unpack``."""
+        """Unpack a stored archive into a folder that is removed at the end. Raises ``BadFile`` and the errors of
+        ``unpack``.
+        """
         with self.temporary_folder() as folder:
             unpack(self.verified(digest), folder, limits)
             yield folder
@@ -234,7 +241,8 @@ class Store:
 
     @contextmanager
     def kept_if(self, temporary: Path, digest: str) -> Iterator[None]:
-        """Keep a complete file while the block adds its row to the catalogue. If the block fails, the file is removed again.
+        """Keep a complete file while the block adds its row to the catalogue. If the block fails, the file is removed
+        again.
 
         The file is not removed if it existed before, or if it is stored again during the block: another row may need
         it.
@@ -259,8 +267,8 @@ class Store:
     def remove(self, digest: str, kept_before: float) -> bool:
         """Move a file aside. If the file was stored again since ``kept_before``, or no longer exists, do nothing.
 
-        Returns whether the file was moved. The time of a file is checked after the move. Otherwise a file that is stored
-        at the same moment could be moved too.
+        Returns whether the file was moved. The time of a file is checked after the move. Otherwise a file that is
+        stored at the same moment could be moved too.
         """
         target, aside = self._place(digest), self._aside / digest
         try:
@@ -300,7 +308,8 @@ class Store:
 
 
 def open_store(settings: Settings, *, within_requests: bool = False) -> Store:
-    """The store that the settings name: a local folder, or S3. Raises ``MissingExtra`` if the packages for S3 are missing.
+    """The store that the settings name: a local folder, or S3. Raises ``MissingExtra`` if the packages for S3 are
+    missing.
 
     within_requests: whether people wait for the answers; calls of S3 then give up earlier.
     """

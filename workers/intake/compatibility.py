@@ -1,4 +1,5 @@
-"""Checks before a job is queued: whether an image, a PSF and the options fit each other, and whether the PSF is deprecated.
+"""Checks before a job is queued: whether an image, a PSF and the options fit each other, and whether the PSF is
+deprecated.
 
 These checks use the header cards that the catalogue stores. The job repeats them, with the same functions, on the
 headers of the files.
@@ -41,8 +42,8 @@ class PsfOrigin:
 def check(request: ResolvedDeconvolve, psf: PsfRow | None, header: Mapping[str, Any]) -> None:
     """Raise the errors that the job would raise for the headers of its image and its PSF.
 
-    psf: the row of the PSF; None: the PSF is not built yet. header: the header summary that is stored with the image. Codes:
-    "channel-mismatch", "plate-scale-mismatch".
+    psf: the row of the PSF; None: the PSF is not built yet. header: the header summary that is stored with the image.
+    Codes: "channel-mismatch", "plate-scale-mismatch".
     """
     cards = header["cards"]
     origin = _origin(request, psf)
@@ -52,8 +53,9 @@ def check(request: ResolvedDeconvolve, psf: PsfRow | None, header: Mapping[str, 
 
 
 def suits(psf: PsfRow | str, header: Mapping[str, Any]) -> bool:
-    """Whether the channel and the pixels of an image fit a PSF. psf: its row, or the name of its instrument. header: as in
-    ``check``."""
+    """Whether the channel and the pixels of an image fit a PSF. psf: its row, or the name of its instrument. header: as
+    in ``check``.
+    """
     origin = _origin_of(psf) if isinstance(psf, str) else _origin_of_row(psf)
     try:
         check_channel(origin, header["cards"])
@@ -65,7 +67,8 @@ def suits(psf: PsfRow | str, header: Mapping[str, Any]) -> bool:
 
 def of_upload(row: PsfRow, instrument: str | None, angstrom: float | None) -> tuple[str | None, float | None]:
     """The instrument and the wavelength of a PSF: the values in its file, or else the values in the request of its
-    upload."""
+    upload.
+    """
     channel = without_variant(row.channel or "")
     if angstrom is None and channel.isdecimal():
         angstrom = float(channel)
@@ -104,7 +107,8 @@ def _origin_of(name: str) -> PsfOrigin:
 class Deprecation:
     """Why a PSF is deprecated, and what replaces it.
 
-    reason: empty if none was given. redo_with: the certified PSF at the end of the chain of successors; None if there is none.
+    reason: empty if none was given. redo_with: the certified PSF at the end of the chain of successors; None if there
+    is none.
     """
 
     reason: str
@@ -129,8 +133,9 @@ def check_not_deprecated(catalogue: Catalogue, psf_id: str, owner: str, what: st
 
 
 def deprecated_warning(catalogue: Catalogue, psf: PsfRow) -> str | None:
-    """The warning for users of a deprecated PSF, or of a PSF that was interpolated from a deprecated PSF; None for every
-    other PSF."""
+    """The warning for users of a deprecated PSF, or of a PSF that was interpolated from a deprecated PSF; None for
+    every other PSF.
+    """
     if psf.status != PsfStatus.DEPRECATED:
         return _end_warning(catalogue, psf) if psf.origin == INTERPOLATED else None
     better = "another PSF" if psf.successor_id is None else f"its successor {psf.successor_id[:SHOWN_DIGITS]}"
@@ -146,8 +151,10 @@ def _end_warning(catalogue: Catalogue, psf: PsfRow) -> str | None:
         end = catalogue.get(PsfRow, end_id, psf.owner)
         if end is not None and end.status == PsfStatus.DEPRECATED:
             return (
-                f"PSF {psf.id[:SHOWN_DIGITS]} ({psf.name} {psf.version}) was interpolated from PSF {end_id[:SHOWN_DIGITS]} "
-                f"({end.name} {end.version}), which was deprecated ({_reason(catalogue, end)}); use another PSF for new products"
+                f"PSF {psf.id[:SHOWN_DIGITS]} ({psf.name} {psf.version}) was interpolated from PSF "
+                f"{end_id[:SHOWN_DIGITS]} "
+                f"({end.name} {end.version}), which was deprecated ({_reason(catalogue, end)}); use another PSF for "
+                "new products"
             )
     return None
 
@@ -179,7 +186,9 @@ def _reason(catalogue: Catalogue, psf: PsfRow) -> str:
 
 
 def _last_reason(catalogue: Catalogue, psf: PsfRow) -> str:
-    """The last reason that was given; empty if none was given. A later change that only names a successor may have no reason."""
+    """The last reason that was given; empty if none was given. A later change that only names a successor may have no
+    reason.
+    """
     changes = catalogue.psfs.changes(psf.id, psf.owner)
     reasons = [one.reason for one in changes if one.status == PsfStatus.DEPRECATED and one.reason]
     return reasons[-1] if reasons else ""

@@ -1,8 +1,8 @@
 """What jobs cost: figures that were measured, which need no catalogue.
 
-`python -m benchmarks.estimates` prints the measured times and memory beside the estimates. Times in seconds are processor time on one
-core of a machine of 2026. A time here may be wrong by a factor of two: `workers.intake.estimates` multiplies it by a factor that
-the service measures. The memory is an upper bound.
+`python -m benchmarks.estimates` prints the measured times and memory beside the estimates. Times in seconds are
+processor time on one core of a machine of 2026. A time here may be wrong by a factor of two: `workers.intake.estimates`
+multiplies it by a factor that the service measures. The memory is an upper bound.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from typing import Any
 class Cost:
     """Time (s, and ns for each pixel that the job reads) and memory (MiB, and bytes for each pixel) of a kind of job.
 
-    times: factors of the time, by the names of the parameters that cause them if the request sets them. runs: by scheme, what each
-    run adds to the time, as a share of it.
+    times: factors of the time, by the names of the parameters that cause them if the request sets them. runs: by
+    scheme, what each run adds to the time, as a share of it.
     """
 
     base_s: float
@@ -42,7 +42,9 @@ COSTS = {
 
 
 def job_s(kind: str, parameters: Mapping[str, Any], pixels: float) -> float:
-    """The estimated processor time of a job that reads this number of pixels, s; without the steps of a deconvolution."""
+    """The estimated processor time of a job that reads this number of pixels, s; without the steps of a
+    deconvolution.
+    """
     cost = COSTS.get(kind, OTHER)
     cpu_s = cost.base_s + cost.pixel_ns * 1e-9 * pixels
     for parameter, factor in cost.times.items():

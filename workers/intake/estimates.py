@@ -1,8 +1,9 @@
 """Estimates the time and memory of a job from the sizes of its inputs, before the job is accepted.
 
-The time is a constant and a time for each pixel, and of a deconvolution for each step. It is multiplied by a factor that was measured
-in this catalogue: on the completed jobs of the same kind that were of the most similar size, and for the images of a bulk run on
-the images of the newest run. A wrong estimate does little harm, because a job that takes too long is stopped, and no memory is reserved.
+The time is a constant and a time for each pixel, and of a deconvolution for each step. It is multiplied by a factor
+that was measured in this catalogue: on the completed jobs of the same kind that were of the most similar size, and for
+the images of a bulk run on the images of the newest run. A wrong estimate does little harm, because a job that takes
+too long is stopped, and no memory is reserved.
 
 | symbol | name | unit |
 |---|---|---|
@@ -44,15 +45,17 @@ BULK = "bulk-image"  # takes the place of a kind for the images of bulk runs
 # computed nothing. Such jobs are left out.
 FOUND = 0.05
 KEEP_FACTOR_S = 60.0
-# A deconvolution: ns for each pixel of the plane and step; and the deconvolutions with other PSFs, two for each parameter of a fitted
-# PSF, that its errors need.
+# A deconvolution: ns for each pixel of the plane and step; and the deconvolutions with other PSFs, two for each
+# parameter of a fitted PSF, that its errors need.
 STEP_NS, PSF_DRAWS = 27.0, 8
-# A PSF build: the time for each spectral line and for each of its meshes on the grid of REACH_GRID_PX, s; ns for each point of the analytic
-# pattern, and for each cell of a mask and each of its outlines. The transform of a mask takes as long as LEAST_OUTLINES.
+# A PSF build: the time for each spectral line and for each of its meshes on the grid of REACH_GRID_PX, s; ns for each
+# point of the analytic pattern, and for each cell of a mask and each of its outlines. The transform of a mask takes as
+# long as LEAST_OUTLINES.
 LINE_S, MESH_S, POINT_NS, OUTLINE_NS = 1.0, 3.5, 520.0, 1.15
 LEAST_CELLS, LEAST_OUTLINES = 28_674, 16
-# Its memory, MiB: of the grid, and of the patterns of meshes and masks; bytes: for each point, for each cell of a rotated mesh, for each
-# edge in a row of the mask, for each row of the mask and pixel of an edge of the grid, and for each pixel of a mask image.
+# Its memory, MiB: of the grid, and of the patterns of meshes and masks; bytes: for each point, for each cell of a
+# rotated mesh, for each edge in a row of the mask, for each row of the mask and pixel of an edge of the grid, and for
+# each pixel of a mask image.
 GRID_MIB, MESHES_MIB = 500.0, 350.0
 POINT_BYTES, CELL_BYTES, ENTRY_BYTES, SPECTRUM_BYTES, IMAGE_BYTES = 120.0, 400.0, 8.0, 8.0, 32.0
 _times: WeakKeyDictionary[Catalogue, dict[str, tuple[list[tuple[float, float]], float]]] = WeakKeyDictionary()
@@ -78,8 +81,10 @@ def checked(
     if expected.memory_mib > settings.max_job_memory_mib:
         raise DataError(
             "too-much-memory",
-            f"expected a job of at most {settings.max_job_memory_mib} MiB (HELIOPSF_MAX_JOB_MEMORY_MIB; its default follows "
-            f"from the memory and the worker processes of the service's machine); this one needs about {expected.memory_mib} "
+            f"expected a job of at most {settings.max_job_memory_mib} MiB (HELIOPSF_MAX_JOB_MEMORY_MIB; its default "
+            "follows "
+            "from the memory and the worker processes of the service's machine); this one needs about "
+            f"{expected.memory_mib} "
             f"MiB: {KINDS[kind].memory_advice}",
         )
     if expected.seconds > settings.max_job_s:
@@ -112,8 +117,9 @@ def estimate(
 
 
 def factor(kind: str, start_s: float, catalogue: Catalogue) -> float:
-    """The median ratio of measured to estimated time of completed jobs of this kind, of those whose estimate was nearest to
-    ``start_s``; 1 if there are too few."""
+    """The median ratio of measured to estimated time of completed jobs of this kind, of those whose estimate was
+    nearest to ``start_s``; 1 if there are too few.
+    """
     known = _times.setdefault(catalogue, {})
     times, until = known.get(kind, ([], -math.inf))
     if time.monotonic() >= until:
@@ -173,7 +179,9 @@ def _deconvolution(parameters: Mapping[str, Any], catalogue: Catalogue, owner: s
 def estimate_build(
     parameters: Mapping[str, Any], catalogue: Catalogue | None = None, owner: str = ""
 ) -> tuple[float, float]:
-    """The processor time, s, and the memory, MiB, of a PSF build. catalogue: of the mask image; None: the build has none."""
+    """The processor time, s, and the memory, MiB, of a PSF build. catalogue: of the mask image; None: the build has
+    none.
+    """
     size = max(parameters["size"], REACH_GRID_PX)
     grid = size / REACH_GRID_PX
     if not (parameters.get("instrument") or parameters.get("instrument_file")):

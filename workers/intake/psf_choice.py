@@ -135,7 +135,8 @@ def _look(catalogue: Catalogue, wanted: PsfFilter, owner: str, pinned: PsfContex
 def look_for_image(
     catalogue: Catalogue, header: Mapping[str, Any], owner: str, context: str | None, kind: str = TOTAL
 ) -> SearchResult:
-    """The PSFs for the instrument, channel and time of an image. header: the header summary that is stored with the upload.
+    """The PSFs for the instrument, channel and time of an image. header: the header summary that is stored with the
+    upload.
 
     If the channel has variants, the filter and the plate scale in the header choose the variant.
     Raises ``DataError`` "no-instrument", "no-date", "no-such-context" or "several-variants-fit".
@@ -182,7 +183,8 @@ def picked_for_image(
 ) -> SearchResult | None:
     """Find the PSF for an image if the request names no PSF; None if the series of the image has no certified PSF.
 
-    Raises the same ``DataError`` as ``look_for_image``, and "no-psf-fits" if the series has PSFs, but the context contains none of them.
+    Raises the same ``DataError`` as ``look_for_image``, and "no-psf-fits" if the series has PSFs, but the context
+    contains none of them.
     """
     pinned = catalogue.contexts.for_request(context, owner)
     instrument, channel = _seen_as(catalogue, header, owner, pinned, TOTAL)
@@ -283,7 +285,8 @@ def _why_interpolated(interpolation: PsfInterpolate, catalogue: Catalogue, owner
         row = catalogue.get(PsfRow, psf_id, owner)
         named = psf_id[:12] if row is None else f"{psf_id[:12]} ({row.name} {row.version})"
         said.append(
-            f"PSF {named}, which holds {until} {interpolation.before_time if until == 'until' else interpolation.after_time}"
+            f"PSF {named}, which holds {until} "
+            f"{interpolation.before_time if until == 'until' else interpolation.after_time}"
         )
     return f"This PSF is interpolated to {interpolation.time}, between {said[0]}, and {said[1]}"
 
@@ -291,7 +294,10 @@ def _why_interpolated(interpolation: PsfInterpolate, catalogue: Catalogue, owner
 def _why_built(wanted: Deconvolve, catalogue: Catalogue, owner: str) -> str:
     image = catalogue.get(ImageRow, wanted.image_id, owner)
     series = None if image is None else series_of(*seen_through(image.summary), TOTAL)
-    return f"No PSF of {series or 'this instrument'} is certified, so the PSF is built from the instrument file that heliopsf ships"
+    return (
+        f"No PSF of {series or 'this instrument'} is certified, so the PSF is built from the instrument file that "
+        "heliopsf ships"
+    )
 
 
 def no_psf(catalogue: Catalogue, header: Mapping[str, Any], owner: str) -> DataError:

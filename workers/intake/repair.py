@@ -1,5 +1,6 @@
 """Results that were deleted, or whose files were lost or damaged: find the jobs that make them again, and queue these
-jobs."""
+jobs.
+"""
 
 from __future__ import annotations
 
@@ -115,5 +116,6 @@ def make_again(row: ProductRow | PsfRow | ReportRow, catalogue: Catalogue, store
 def _unknown(row: ProductRow | PsfRow | ReportRow) -> DataError:
     return DataError(
         "parameters-unknown",
-        f"expected a job that makes {row.id} again; its job was deleted, or needs a file that is lost: submit the request again",
+        f"expected a job that makes {row.id} again; its job was deleted, or needs a file that is lost: submit the "
+        "request again",
     )

@@ -63,10 +63,11 @@ def resolve(
 ) -> tuple[dict[str, Any], str]:
     """Resolved parameters, and the identity of the job's result.
 
-    added_effects: modules with effects that the operator adds to the library of a gap diagnosis. Raises
-    ``DataError`` "no-such-image", "no-such-psf", "no-such-transit", "no-such-product", "no-psf-for-instrument", "psf-deprecated",
-    "no-noise-figures", "no-known-psf", "unknown-instrument", "bad-instrument-file", "already-deconvolved", "psf-as-image",
-    "channel-mismatch" or "plate-scale-mismatch", and the errors of ``workers.intake.psf_choice`` and ``workers.lineage.made_by``.
+    added_effects: modules with effects that the operator adds to the library of a gap diagnosis. Raises ``DataError``
+    "no-such-image", "no-such-psf", "no-such-transit", "no-such-product", "no-psf-for-instrument", "psf-deprecated",
+    "no-noise-figures", "no-known-psf", "unknown-instrument", "bad-instrument-file", "already-deconvolved",
+    "psf-as-image", "channel-mismatch" or "plate-scale-mismatch", and the errors of ``workers.intake.psf_choice`` and
+    ``workers.lineage.made_by``.
     """
     kind = KINDS[request.kind]
     resolver = load(kind.resolver)
@@ -82,8 +83,8 @@ def resolve(
 def resolve_by_ids(submission: Submission) -> Parameters:
     """Check the ids in the parameters, and add the recipe of the diffraction PSF if the kind needs one.
 
-    A parameter is an id if its name is ``image_id``, ``psf_id`` or ``transit_id``, or ends in ``_image_id``, ``_psf_id`` or
-    ``_transit_id``.
+    A parameter is an id if its name is ``image_id``, ``psf_id`` or ``transit_id``, or ends in ``_image_id``,
+    ``_psf_id`` or ``_transit_id``.
     """
     parameters = submission.parameters
     for name, identity in parameters:
@@ -144,7 +145,9 @@ def resolve_deconvolve(submission: Submission) -> Parameters:
 def resolved_deconvolution(
     wanted: Deconvolve, header: dict[str, Any], catalogue: Catalogue, owner: str
 ) -> ResolvedDeconvolve:
-    """The resolved deconvolution of an image with this header, with its PSF. Raises the same ``DataError`` as ``resolve``."""
+    """The resolved deconvolution of an image with this header, with its PSF. Raises the same ``DataError`` as
+    ``resolve``.
+    """
     if not wanted.again:
         check_not_deconvolved(header["content"])
     if wanted.region is not None:
@@ -171,15 +174,17 @@ def _diffraction_of(submission: Submission, summary: dict[str, Any]) -> PsfBuild
         psf_identity(recipe),
         submission.owner,
         f"the diffraction PSF that heliopsf builds for {recipe.instrument}",
-        "name the file of another diffraction PSF as known_psf in transit.json; to use the deprecated PSF anyway, write it "
+        "name the file of another diffraction PSF as known_psf in transit.json; to use the deprecated PSF anyway, "
+        "write it "
         "to a file with `heliopsf psf download {psf} -o FILE` and name that file as known_psf",
     )
     return recipe
 
 
 def _psf_for(catalogue: Catalogue, header: dict[str, Any], wanted: Deconvolve, owner: str) -> dict[str, Any]:
-    """The PSF that the request names; else the certified PSF that fits the image, or the PSF that is interpolated between
-    two certified PSFs; else the PSF that is built for the instrument."""
+    """The PSF that the request names; else the certified PSF that fits the image, or the PSF that is interpolated
+    between two certified PSFs; else the PSF that is built for the instrument.
+    """
     if wanted.psf_id is not None:
         row_of(catalogue, PsfRow, wanted.psf_id, owner)
         return {"psf_id": wanted.psf_id}

@@ -70,8 +70,8 @@ def uploaded_psf_row(
 ) -> PsfRow:
     """The row of an uploaded PSF, with status draft.
 
-    A name, version, instrument or channel that the request does not give is taken from the header. Without a name in the
-    header, the PSF gets the name of the file. Longer texts of the header are cut.
+    A name, version, instrument or channel that the request does not give is taken from the header. Without a name in
+    the header, the PSF gets the name of the file. Longer texts of the header are cut.
     """
     header = _summary(summary)
     instrument = instrument or instrument_of(header)

@@ -45,7 +45,8 @@ class Cancelled(Exception):
 
 @dataclass
 class Attempt:
-    """A claimed job while it runs. The first report of progress later than ``max_job_s`` after ``started`` stops the job.
+    """A claimed job while it runs. The first report of progress later than ``max_job_s`` after ``started`` stops the
+    job.
 
     child: this process; None if it must not be ended. The process is ended if the job must stop but still runs
     ``cancel_s`` later, or if the thread of the heartbeats cannot run for ``silent_s``.
@@ -92,8 +93,8 @@ class Attempt:
                     return
                 alive = self.catalogue.jobs.heartbeat(self.lease)
             except (SQLAlchemyError, MemoryError) as error:
-                # Try again at the next heartbeat. If the database stays away, the lease expires and another worker gets the
-                # job. MemoryError: the job has reached its memory limit, and its task gets the error too.
+                # Try again at the next heartbeat. If the database stays away, the lease expires and another worker gets
+                # the job. MemoryError: the job has reached its memory limit, and its task gets the error too.
                 log.warning("job %s: could not write the heartbeat: %r", self.lease.job_id, error)
                 continue
             if not alive:

@@ -2,10 +2,10 @@
 
 ``Stopping`` is the flag with which the parent tells the process that the worker has to stop.
 
-The limit is RLIMIT_DATA. Linux counts private writable memory against it: the heap, arrays, and the stacks of threads. It
-does not count memory that is only reserved, or files that are mapped for reading; RLIMIT_AS would count both, and numba,
-LLVM and the memory allocator reserve much more than they use. An allocation beyond the limit raises MemoryError. On
-systems other than Linux, memory is not limited.
+The limit is RLIMIT_DATA. Linux counts private writable memory against it: the heap, arrays, and the stacks of threads.
+It does not count memory that is only reserved, or files that are mapped for reading; RLIMIT_AS would count both, and
+numba, LLVM and the memory allocator reserve much more than they use. An allocation beyond the limit raises MemoryError.
+On systems other than Linux, memory is not limited.
 
 When a worker process has ended, its parent starts a new one (Celery's prefork pool). Other processes of the worker
 continue.
@@ -45,7 +45,9 @@ class Child:
 
     @contextmanager
     def limited(self, estimate_mib: int) -> Iterator[None]:
-        """Limit the memory that the block may use to MARGIN times the estimate, in addition to the memory in use already."""
+        """Limit the memory that the block may use to MARGIN times the estimate, in addition to the memory in use
+        already.
+        """
         if sys.platform != "linux":
             yield
             return
@@ -82,7 +84,8 @@ class Child:
 
 
 class Stopping:
-    """The stop flag, shared with child processes that are forked later: the parent gets the signal, and a child runs the job.
+    """The stop flag, shared with child processes that are forked later: the parent gets the signal, and a child runs
+    the job.
 
     The flag is one number in shared memory. The flag has no lock, because a signal handler writes it.
     """

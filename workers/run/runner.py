@@ -1,5 +1,6 @@
 """Runs one job: claims it, sends heartbeats, runs its task and records the outcome. No other module turns an
-exception into the error of a job."""
+exception into the error of a job.
+"""
 
 from __future__ import annotations
 
@@ -73,7 +74,8 @@ class Runner:
 
     def run_next(self, told_id: str, queue: Queue) -> None:
         """Run the next job of a queue: a job of the owner whose turn it is. The message of the broker names the job
-        ``told_id``."""
+        ``told_id``.
+        """
         if self._stopping.asked:
             left = self._catalogue.turns.leave_next(told_id, queue)
             log.info("job %s: left in the queue because this worker is stopping", left)
@@ -185,7 +187,9 @@ class Runner:
             raise DataError("quota-exceeded", usage.no_room(NOT_KEPT))
 
     def _keep_times(self, job: JobRow, times: StageTimer) -> None:
-        """Add the stage times of an attempt to the sums. The outcome of the attempt is already recorded, so a failure here is only logged."""
+        """Add the stage times of an attempt to the sums. The outcome of the attempt is already recorded, so a failure
+        here is only logged.
+        """
         spent = times.end()
         traces.note({f"heliopsf.stage.{name}_s": round(stage.seconds, 3) for name, stage in spent.items()})
         try:
@@ -230,7 +234,10 @@ class Runner:
         if not is_out_of_memory(error):
             return _internal(job, error)
         estimate_mib = self._estimate_mib(job)
-        limit = f"expected a job of at most {allowed_mib(estimate_mib)} MiB, {MARGIN:g} times its estimate of {estimate_mib} MiB"
+        limit = (
+            f"expected a job of at most {allowed_mib(estimate_mib)} MiB, {MARGIN:g} times its estimate of "
+            f"{estimate_mib} MiB"
+        )
         if self._child is None:
             limit = f"expected enough memory for a job of about {estimate_mib} MiB"
         message = f"{limit}; the job needed more: {KINDS[job.kind].memory_advice}"
@@ -251,7 +258,10 @@ class Runner:
         elif is_disk_full(error):  # the disk of the database is full
             self._fail(lease, JobError(fault=Fault.TRANSIENT, code=STORAGE_FULL, message=NO_ROOM))
         else:
-            message = f"expected a temporary failure to end; {job.attempt} attempts failed ({type(error).__name__}): try again later"
+            message = (
+                f"expected a temporary failure to end; {job.attempt} attempts failed ({type(error).__name__}): "
+                "try again later"
+            )
             self._fail(lease, JobError(fault=Fault.TRANSIENT, code="gave-up", message=message))
 
     def _fail(self, lease: Lease, error: JobError) -> None:
@@ -274,7 +284,8 @@ class Runner:
 
 def _internal(job: JobRow, error: Exception) -> JobError:
     """An error of the software. The text of the exception is written only into the operator's log, because this text
-    may contain names of files and SQL statements."""
+    may contain names of files and SQL statements.
+    """
     message = (
         f"the software failed ({type(error).__name__}): send the job id {job.id} to the operator, whose worker log has "
         "the details"

@@ -2,8 +2,9 @@
 
 The parent loads no numerical libraries. Each child loads them after the fork, with its share of the threads.
 
-On SIGTERM, or one Control-C, the worker takes no more jobs. The running job may continue for ``stop_s`` seconds;
-then it is handed back and queued as if it had not started. After ``gone_s`` seconds the worker exits even if this has not succeeded.
+On SIGTERM, or one Control-C, the worker takes no more jobs. The running job may continue for ``stop_s`` seconds; then
+it is handed back and queued as if it had not started. After ``gone_s`` seconds the worker exits even if this has not
+succeeded.
 """
 
 from __future__ import annotations
@@ -163,8 +164,8 @@ def _look_for_jobs(within_s: float) -> None:
 def _end_when_idle(after_s: float) -> None:
     """End this worker in the same way as SIGTERM, when it has had nothing to do for ``after_s`` seconds.
 
-    Messages do not count, because a long queue leaves many for jobs that have ended. Only the help for another worker's job is
-    not in the table of jobs.
+    Messages do not count, because a long queue leaves many for jobs that have ended. Only the help for another worker's
+    job is not in the table of jobs.
     """
     while not stopping.asked:
         if any(request.name == queue.ASSIST for request in state.active_requests):

@@ -134,11 +134,12 @@ class CatalogueWorkspace(Workspace):
         )
 
     def _requested_psf(self, request: ResolvedDeconvolve) -> PsfRow:
-        """The row of the PSF that a deconvolution names. If the catalogue does not contain this PSF, it is made first: built
-        from its recipe, or interpolated between two PSFs, if the request says how.
+        """The row of the PSF that a deconvolution names. If the catalogue does not contain this PSF, it is made first:
+        built from its recipe, or interpolated between two PSFs, if the request says how.
 
-        Raises DataError "no-such-psf", "instrument-changed" if the recipe now gives another PSF, "interpolation-changed" if
-        this version interpolates in another way, and the errors of ``workers.tasks.interpolation``.
+        Raises DataError "no-such-psf", "instrument-changed" if the recipe now gives another PSF,
+        "interpolation-changed" if this version interpolates in another way, and the errors of
+        ``workers.tasks.interpolation``.
         """
         recipe, interpolation = request.psf_recipe, request.psf_interpolation
         made = self.made(PsfRow, request.psf_id) if recipe or interpolation else None
@@ -148,7 +149,8 @@ class CatalogueWorkspace(Workspace):
             if interpolated_psf_identity(interpolation) != request.psf_id:
                 raise DataError(
                     "interpolation-changed",
-                    f"expected the interpolation that gave PSF {request.psf_id} when the job was submitted; this version "
+                    f"expected the interpolation that gave PSF {request.psf_id} when the job was submitted; this "
+                    "version "
                     "interpolates in another way: submit the job again",
                 )
             KINDS["psf-interpolate"].load_task()(self, interpolation.model_dump())
@@ -157,7 +159,8 @@ class CatalogueWorkspace(Workspace):
             if identity != request.psf_id:
                 raise DataError(
                     "instrument-changed",
-                    f"expected PSF {request.psf_id} from the instrument file of {recipe.instrument}; got {identity}: the "
+                    f"expected PSF {request.psf_id} from the instrument file of {recipe.instrument}; got {identity}: "
+                    "the "
                     "file changed after the job was submitted; submit the job again",
                 )
         return self.row(PsfRow, request.psf_id)
@@ -209,7 +212,8 @@ class CatalogueWorkspace(Workspace):
         ):
             raise DataError(
                 "psf-not-the-same",
-                f"expected the lost file of PSF {kept.id} to be made again bit for bit, because the PSF was certified; this "
+                f"expected the lost file of PSF {kept.id} to be made again bit for bit, because the PSF was "
+                "certified; this "
                 "version of the software makes another file: ask the operator to restore the store from a backup",
             )
         refiled: ResultRow = self.catalogue.refile(row)
@@ -220,7 +224,8 @@ class CatalogueWorkspace(Workspace):
         files = dict(result.files)
         write, draw = files.pop("file"), files.pop("preview", None)
         with ThreadPoolExecutor(1) as beside:
-            # A worker with one thread draws the picture in this thread: a second thread would slow down the other workers.
+            # A worker with one thread draws the picture in this thread: a second thread would slow down the other
+            # workers.
             drawn = beside.submit(self.write, draw) if draw is not None and self.threads > 1 else None
             file_sha256, size_bytes = self.write(write)
         if draw is not None:
@@ -282,7 +287,9 @@ class CatalogueWorkspace(Workspace):
     def _compute(
         self, part: PartRow, compute: Callable[[int, Progress], Json], done: int, count: int
     ) -> None:
-        """Compute one part, and renew its lease meanwhile. After an exception the part is released for another worker."""
+        """Compute one part, and renew its lease meanwhile. After an exception the part is released for another
+        worker.
+        """
         last = time.monotonic()
 
         def report(_stage: str, _step: int, _steps: int) -> None:

@@ -30,8 +30,9 @@ _SHOWN = ("sentence", "lines", "verdict", "answer", "gap", "cautions")
 
 @task_of("gap-diagnose")
 def gap_diagnose(workspace: Workspace, request: ResolvedGapDiagnose, identity: str) -> None:
-    """Diagnose the gap of a transit, and add the report. If the request asks for it and effects were found, the corrected PSF
-    is another result."""
+    """Diagnose the gap of a transit, and add the report. If the request asks for it and effects were found, the
+    corrected PSF is another result.
+    """
     added = _added(workspace, request)
     parent = None if request.psf_id is None else workspace.psf(request.psf_id)
     transit, _ = load_transit(workspace, request)

@@ -66,7 +66,8 @@ def _epoch(workspace: CatalogueWorkspace, psf_id: str, time: str) -> Epoch:
     """A PSF of the catalogue, and the time at which it holds."""
     row = workspace.row(PsfRow, psf_id)
     psf = workspace.psf_of(row)
-    # The request of an upload or of a certification may give an instrument and a channel that the file does not contain.
+    # The request of an upload or of a certification may give an instrument and a channel that the file does not
+    # contain.
     instrument, angstrom = of_upload(row, psf.instrument, psf.wavelength_angstrom)
     psf = replace(
         psf, name=row.name, version=row.version, instrument=instrument, wavelength_angstrom=angstrom
@@ -81,7 +82,8 @@ def _fit_of(psf: Psf, threads: int) -> dict[str, Any]:
     curve, sigma = cumulative_curve(psf.kernel, radii), curve_sigma(psf, radii, threads=threads)
     before, after = psf.provenance["interpolated_between"]
     return {
-        "sentence": f"Interpolated to {psf.provenance['interpolated_at']} between {before['name']} {before['version']} (weight "
+        "sentence": f"Interpolated to {psf.provenance['interpolated_at']} between {before['name']} "
+        f"{before['version']} (weight "
         f"{before['weight']:.3f}) and {after['name']} {after['version']} (weight {after['weight']:.3f}).",
         "shape": psf.fitted.shape,
         "parameters": parameters_of(psf.fitted),

@@ -33,8 +33,9 @@ Thing = ProductRow | PsfRow
 
 @dataclass(frozen=True)
 class RerunWorkspace(CatalogueWorkspace):
-    """A workspace in which the results in `hidden` do not exist, so that a task makes them again. The rows of new results are in
-    `rows` and not in the catalogue."""
+    """A workspace in which the results in `hidden` do not exist, so that a task makes them again. The rows of new
+    results are in `rows` and not in the catalogue.
+    """
 
     hidden: frozenset[str] = frozenset()
     rows: list[ResultRow] = field(default_factory=list)

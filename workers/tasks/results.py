@@ -38,8 +38,9 @@ def psf_result(
 ) -> Result:
     """A draft PSF.
 
-    write: writes its file; None: `write_psf`. draw: draws its picture into a PNG file; None: the PSF and its curves. channel: None: as the PSF says. details: further entries
-    of its details. report: of its fit, as JSON. threads: for its tables.
+    write: writes its file; None: `write_psf`. draw: draws its picture into a PNG file; None: the PSF and its curves.
+    channel: None: as the PSF says. details: further entries of its details. report: of its fit, as JSON. threads: for
+    its tables.
     """
     channel = channel or channel_of(psf.instrument, psf.wavelength_angstrom)
     return Result(
@@ -93,8 +94,10 @@ def report_result(
     transit_id: str | None = None,
     about_id: str | None = None,
 ) -> Result:
-    """A report. content: its JSON. details: the entry "sentence" and the main figures; lists of reports show them. draw, page: make
-    its picture (PNG) and its page (HTML). transit_id, about_id: the transit, or the PSF or product, that it is about."""
+    """A report. content: its JSON. details: the entry "sentence" and the main figures; lists of reports show them.
+    draw, page: make its picture (PNG) and its page (HTML). transit_id, about_id: the transit, or the PSF or product,
+    that it is about.
+    """
     files: dict[str, Write] = {"file": partial(write_json, content=content)}
     if draw is not None:
         files["preview"] = draw
@@ -108,7 +111,9 @@ def report_result(
 
 
 def provenance_of(job_id: str, request: Parameters) -> dict[str, Any]:
-    """The inputs, parameters and software versions with which a job makes its result. request: the resolved parameters."""
+    """The inputs, parameters and software versions with which a job makes its result. request: the resolved
+    parameters.
+    """
     transit_id = getattr(request, "transit_id", None)
     return {
         **({} if transit_id is None else {"transit_sha256": transit_id}),

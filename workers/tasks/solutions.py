@@ -57,9 +57,9 @@ class KeptSolutions:
     ) -> Solution:
         """The solution of a transit: the owner's stored solution if it exists; otherwise a new solution.
 
-        A new solution is stored if the owner's quota allows it. A rerun always computes a new solution and does not store
-        it. transit: as ``load_transit`` returns it for the request; only its noise may be replaced. Raises DataError as
-        ``psfcore.scatter.inversion.invert`` does.
+        A new solution is stored if the owner's quota allows it. A rerun always computes a new solution and does not
+        store it. transit: as ``load_transit`` returns it for the request; only its noise may be replaced. Raises
+        DataError as ``psfcore.scatter.inversion.invert`` does.
         """
         identity = solution_identity(request, transit, shape, start)
         kept = None if self.anew else self._kept(identity, transit, threads)

@@ -17,8 +17,8 @@ def load_transit(
 ) -> tuple[Transit, Prepared]:
     """Unpack, read and prepare the transit that a request names.
 
-    diffraction: the diffraction PSF to use if the transit contains none; None: build it from the request's recipe. It is not
-    cropped to the field of view: its kernel of 2048 × 2048 px sums to 1.
+    diffraction: the diffraction PSF to use if the transit contains none; None: build it from the request's recipe. It
+    is not cropped to the field of view: its kernel of 2048 × 2048 px sums to 1.
 
     Raises DataError "no-such-transit", "no-known-psf", and the errors of unpacking and preparing.
     """
@@ -29,7 +29,8 @@ def load_transit(
         if request.diffraction_recipe is None:
             raise DataError(
                 "no-known-psf",
-                "expected known_psf in transit.json, or an instrument whose diffraction PSF can be built; got neither: add "
+                "expected known_psf in transit.json, or an instrument whose diffraction PSF can be built; got "
+                "neither: add "
                 "the file of the known PSF to the transit",
             )
         return workspace.built_psf(request.diffraction_recipe).kernel

@@ -35,16 +35,17 @@ PARTS = "folds"  # the stage of the parts of a job
 
 class TurnOver(Exception):
     """A turn of a bulk run ends before all images are done, so that other jobs can run. The job of the turn is queued
-    again as if it had not started."""
+    again as if it had not started.
+    """
 
 
 @dataclass(frozen=True)
 class Result:
     """A result of a task, whose files are not yet written.
 
-    details: the entries that describe it. files: functions that write its files, by name: "file" is the result itself, "preview"
-    its picture (PNG), "html" its page. columns: the further columns of its row in a catalogue. figures: draws the figures of the
-    page (PNG).
+    details: the entries that describe it. files: functions that write its files, by name: "file" is the result itself,
+    "preview" its picture (PNG), "html" its page. columns: the further columns of its row in a catalogue. figures: draws
+    the figures of the page (PNG).
     """
 
     type: ResultType
@@ -58,8 +59,8 @@ class Result:
 def task_of(kind: str) -> Callable[[Callable[[Any, Any, str], None]], Task]:
     """Make the task of a kind of job from a function that adds its result: task(workspace, request, identity).
 
-    The task gets the resolved parameters as JSON, and returns the identity of the result. If an earlier job made the result,
-    the function is not called.
+    The task gets the resolved parameters as JSON, and returns the identity of the result. If an earlier job made the
+    result, the function is not called.
     """
     row = KINDS[kind]
 
@@ -81,9 +82,9 @@ def task_of(kind: str) -> Callable[[Callable[[Any, Any, str], None]], Task]:
 class Workspace(ABC):
     """What every task may use.
 
-    report(stage, step, steps): reports progress; raises an exception if the job must stop. times: measures the time of the
-    reported stages. If the pieces of a job report their own stages, the time of these stages is measured instead. anew: True
-    for a rerun: compute everything again.
+    report(stage, step, steps): reports progress; raises an exception if the job must stop. times: measures the time of
+    the reported stages. If the pieces of a job report their own stages, the time of these stages is measured instead.
+    anew: True for a rerun: compute everything again.
     """
 
     settings: Settings
@@ -115,7 +116,9 @@ class Workspace(ABC):
         """The file of an uploaded image. Raises DataError "no-such-image"."""
 
     def shape_to_check(self, request: ResolvedDeconvolve) -> tuple[int, int] | None:
-        """The shape (ny, nx) of an image that must fit into the free memory; None: this was checked when the job was submitted."""
+        """The shape (ny, nx) of an image that must fit into the free memory; None: this was checked when the job was
+        submitted.
+        """
         return None
 
     @abstractmethod
@@ -129,8 +132,9 @@ class Workspace(ABC):
     def build(
         self, recipe: Recipe, mount_image: NDArray[Any] | None, progress: Callable[[int, int], None]
     ) -> tuple[Psf, Callable[[Path], object]]:
-        """The PSF of a recipe, and a function that writes its file. mount_image: the pixels of the mask image of its mount, if
-        it has one."""
+        """The PSF of a recipe, and a function that writes its file. mount_image: the pixels of the mask image of its
+        mount, if it has one.
+        """
         # Most jobs do not load the libraries of the diffraction.
         from psfcore.build import build_recipe
         from psfcore.fits.psfs import write_psf
@@ -147,7 +151,9 @@ class Workspace(ABC):
         """A folder with the files of a transit, and the number of its images. Raises DataError "no-such-transit"."""
 
     def inverter(self, request: ResolvedOnTransit) -> Inverter | None:
-        """A function that gives the solution of the request's transit which an earlier job kept; None: it is computed."""
+        """A function that gives the solution of the request's transit which an earlier job kept; None: it is
+        computed.
+        """
         return None
 
     def parts(self, identity: str, count: int, compute: Callable[[int, Progress], Json]) -> Sequence[Json]:

@@ -1,5 +1,6 @@
 """Effects of the detector and of its readout: changes of the light that reaches it, of the charge that its pixels
-collect, and of the exposure after its photons were detected."""
+collect, and of the exposure after its photons were detected.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +45,8 @@ from psfcore.simulate.plan import COMBINED, Plan
 )
 def intensity_gradient(effect: Effect, seen: Plane, moment: Moment) -> Plane:
     """Sunlight that passes the baffles. It increases towards one side: a plane with a small curvature, 0 in its
-    darkest corner."""
+    darkest corner.
+    """
     along, across = unit_coordinates(seen.shape, effect["angle_deg"])
     plane = along + effect["curvature"] * (along**2 - across**2)
     plane = plane - plane.min()
@@ -99,7 +101,8 @@ def dust_shadow(effect: Effect, seen: Plane, moment: Moment) -> Plane:
 @declare(KNOWN, "expected", ("gain_place",), "share, rms", 0.03, 0.3, seed=seed, patch=(0.05, 0.25))
 def flat_field_residual(effect: Effect, rate: Plane, moment: Moment) -> Plane:
     """The flat field was taken long ago: broad patches, whose rms is the strength, and a pixel-to-pixel variation of
-    half this rms."""
+    half this rms.
+    """
     size = rate.shape[0]
     pattern = patches(size, effect["seed"], effect["patch"]) + 0.5 * _grain(size, effect["seed"])
     return rate * np.maximum(1 + effect.strength * pattern, 0.0)
@@ -113,7 +116,8 @@ def _grain(size: int, seed: int) -> Plane:
 @declare(CALIBRATION, "expected", ("gain_kind", "gain_place"), "s", 0.05, 0.6, angle_deg=ANGLE)
 def shutter_gradient(effect: Effect, rate: Plane, moment: Moment) -> Plane:
     """The shutter moves unevenly: one side of the field is exposed longer. The strength is the difference at the two
-    edges, s."""
+    edges, s.
+    """
     along, _ = unit_coordinates(rate.shape, effect["angle_deg"])
     return rate * np.maximum(1 + effect.strength * along / moment.shot.exposure_s, 0.0)
 
@@ -154,7 +158,8 @@ def brighter_fatter(effect: Effect, rate: Plane, moment: Moment) -> Plane:
 @declare(KNOWN, "read_out", ("offset_place",), "DN", 1.0, 12.0, sign=sign, seed=seed)
 def dark_offset(effect: Effect, dn: Plane, moment: Moment, earlier: list[Earlier]) -> Plane:
     """The subtracted bias was measured on another day: a constant, positive or negative, that varies by 5 % from
-    image to image."""
+    image to image.
+    """
     own = np.random.default_rng([effect["seed"], moment.index]).normal(1.0, 0.05)
     return np.asarray(dn + effect["sign"] * effect.strength * own)
 
@@ -162,7 +167,8 @@ def dark_offset(effect: Effect, dn: Plane, moment: Moment, earlier: list[Earlier
 @declare(KNOWN, "read_out", ("gain_kind",), "share", 0.1, 0.25, sign=sign)
 def gain_mismatch(effect: Effect, dn: Plane, moment: Moment, earlier: list[Earlier]) -> Plane:
     """The ratio of the two gains is wrong: combined images are too bright or too faint compared with high-only
-    images."""
+    images.
+    """
     # As in the library, this also changes faint pixels, although a combined image takes them from the high-gain image.
     factor = 1 + effect["sign"] * effect.strength if moment.shot.gain_mode == COMBINED else 1.0
     return dn * factor
@@ -204,7 +210,8 @@ def column_smear(effect: Effect, dn: Plane, moment: Moment, earlier: list[Earlie
 @declare(KNOWN, "read_out", ("memory",), "share at time 0", 0.01, 0.3, decay=(0.5, 2.0))
 def persistence(effect: Effect, dn: Plane, moment: Moment, earlier: list[Earlier]) -> Plane:
     """Traps release charge of the four preceding images, of any pointing. decay: the decay time, in mean times
-    between images."""
+    between images.
+    """
     shots = moment.plan.shots
     decay_s = effect["decay"] * (shots[-1].time_s - shots[0].time_s) / max(len(shots) - 1, 1)
     left = np.zeros_like(dn)
@@ -218,7 +225,8 @@ def persistence(effect: Effect, dn: Plane, moment: Moment, earlier: list[Earlier
 )
 def row_crosstalk(effect: Effect, dn: Plane, moment: Moment, earlier: list[Earlier]) -> Plane:
     """Crosstalk between the channels of the readout: bright pixels cause an echo in their row, at a fixed distance, a
-    few pixels wide."""
+    few pixels wide.
+    """
     bright = np.maximum(dn - effect["above"] * max(float(dn.mean()), 0.0), 0.0)
     late = uniform_filter1d(bright, 5, axis=1, mode="constant")
     shift = round(effect["lag"] * dn.shape[1])

@@ -137,7 +137,8 @@ def declare(
     **draw: Draw,
 ) -> Callable[[Function], Function]:
     """Add the decorated function to EFFECTS, under its own name. options: further fields of `EffectKind`. draw: its
-    parameters."""
+    parameters.
+    """
 
     def add(change: Function) -> Function:
         name = change.__name__
@@ -167,7 +168,8 @@ class Effect:
 
     def as_json(self) -> dict[str, Any]:
         """The effect for the truth of a case. cause: its name in the gap library; None if the library does not
-        contain it."""
+        contain it.
+        """
         kind = self.kind
         return {
             "name": kind.name,
@@ -224,7 +226,8 @@ def seed(plan: Plan, rng: np.random.Generator) -> int:
 
 def near_a_disc(spread: float) -> Callable[[Plan, np.random.Generator], tuple[float, float]]:
     """Draws a point (x, y), fractions of the field, near a random position of the occulter. spread: rms distance per
-    axis."""
+    axis.
+    """
 
     def draw(plan: Plan, rng: np.random.Generator) -> tuple[float, float]:
         shot = plan.shots[int(rng.integers(len(plan.shots)))]

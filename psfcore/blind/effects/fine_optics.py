@@ -64,7 +64,8 @@ class Glass:
 
     def fine(self, turn_deg: float = 0.0, pitch_factor: float = 1.0) -> Kernel:
         """The fine kernel [y, x], sum 1, with the mesh rotated by turn_deg and its order spacing multiplied by
-        pitch_factor."""
+        pitch_factor.
+        """
         size = FINE * self.size_px
         if self.kind == SYNTHETIC:
             kernel = self._drawn(size, turn_deg, pitch_factor)
@@ -123,7 +124,8 @@ def _built(name: str, size: int, turn_deg: float, pitch_factor: float) -> Kernel
 @cache
 def _pupil(name: str, size: int) -> Kernel:
     """The diffraction PSF of an instrument without its entrance mesh, on fine pixels. The result is kept, because the
-    computation takes seconds."""
+    computation takes seconds.
+    """
     instrument = load_instrument(name)
     detector = instrument.detector
     pitch_um, scale_arcsec = detector.pixel_pitch_um / FINE, detector.plate_scale_arcsec / FINE
@@ -160,7 +162,8 @@ class FineOptics:
     @cached_property
     def more_scatter(self) -> Convolver:
         """The convolution with the change of the PSF if the scatter is doubled: light moves from the core to the
-        wings."""
+        wings.
+        """
         moved, middle = self.scatter.copy(), self.scatter.shape[0] // 2
         moved[middle, middle] = 0.0
         moved[middle, middle] = self.scatter[middle, middle] - 1  # minus all scattered light, at any distance
@@ -174,7 +177,7 @@ class FineOptics:
 
     @property
     def offsets_px(self) -> tuple[Kernel, Kernel]:
-        """x (1, n) and y (n, 1) of the fine pixels of the scatter kernel, in detector px from its centre."""
+        """X (1, n) and y (n, 1) of the fine pixels of the scatter kernel, in detector px from its centre."""
         d = (np.arange(self.scatter.shape[0]) - self.scatter.shape[0] // 2) / FINE
         return d[None, :], d[:, None]
 
@@ -202,7 +205,8 @@ def scaled_scatter(falloff: Kernel, law: ScatterTruth, amplitude: float) -> Kern
 
 def binned_kernel(fine: Kernel) -> Kernel:
     """Eq. (1): bin a fine kernel [y, x] of even size to detector pixels. Light is lost only at the edges of the
-    array."""
+    array.
+    """
     columns = convolve1d(fine, _TRIANGLE, axis=1, mode="constant")[:, ::FINE]
     return np.asarray(convolve1d(columns, _TRIANGLE, axis=0, mode="constant")[::FINE])
 

@@ -32,7 +32,8 @@ _FINER = 9  # number of samples in a fine pixel along each axis
 @declare(KNOWN, "optics", ("psf",), "stretch", 0.1, 0.6, angle_deg=_HALF_TURN)
 def anisotropic_scatter(effect: Effect, optics: FineOptics, moment: Moment) -> FineOptics:
     """The mirrors were polished along one direction: scatter is stretched. The stretch grows with the distance r as r
-    / (r + b)."""
+    / (r + b).
+    """
     law = optics.law
     along, across = turned_offsets(optics, effect["angle_deg"])
     r = np.hypot(along, across)
@@ -44,7 +45,8 @@ def anisotropic_scatter(effect: Effect, optics: FineOptics, moment: Moment) -> F
 @declare(CALIBRATION, "optics", ("psf",), "share", 0.2, 0.95, angle_deg=ANGLE, reach_px=(15.0, 80.0))
 def one_sided_scatter(effect: Effect, optics: FineOptics, moment: Moment) -> FineOptics:
     """A mirror is tilted or contaminated on one side: scatter is stronger there, similar to coma, up to a few tens of
-    pixels."""
+    pixels.
+    """
     along, across = turned_offsets(optics, effect["angle_deg"])
     r = np.hypot(along, across)
     isotropic = (optics.law.b_px + r) ** -optics.law.c
@@ -54,7 +56,8 @@ def one_sided_scatter(effect: Effect, optics: FineOptics, moment: Moment) -> Fin
 
 def rescaled(optics: FineOptics, falloff: Plane, before: Plane) -> FineOptics:
     """The telescope with another falloff of the scatter; the total of the scatter stays the same. before: the old
-    falloff."""
+    falloff.
+    """
     amplitude = optics.law.a / FINE**2 * float(before.sum() / falloff.sum())
     return dataclasses.replace(optics, scatter=scaled_scatter(falloff, optics.law, amplitude))
 
@@ -78,7 +81,8 @@ def wide_halo(effect: Effect, optics: FineOptics, moment: Moment) -> FineOptics:
 @declare(KNOWN, "optics", ("core",), "px", 1.0, 3.0, {"power": 1.5}, angle_deg=_HALF_TURN, jitter=coin)
 def core_blur(effect: Effect, optics: FineOptics, moment: Moment) -> FineOptics:
     """A Moffat profile blurs the core (defocus, figure errors), or a motion spreads it along a straight line
-    (jitter)."""
+    (jitter).
+    """
     width = effect.strength
     return _blurred(optics, _line(width, effect["angle_deg"]) if effect["jitter"] else _moffat(width))
 
@@ -86,7 +90,8 @@ def core_blur(effect: Effect, optics: FineOptics, moment: Moment) -> FineOptics:
 @declare(CALIBRATION, "optics", ("psf_time", "core"), "px at the end", 2.0, 8.0, VARIES | {"power": 1.5})
 def focus_drift(effect: Effect, optics: FineOptics, moment: Moment) -> FineOptics:
     """The telescope's structure warms: blur by a uniform disc, whose diameter grows from 0 to the strength at the
-    last image."""
+    last image.
+    """
     diameter = effect.strength * moment.elapsed
     return optics if diameter == 0 else _blurred(optics, _pillbox(diameter))
 
@@ -133,7 +138,8 @@ def _line(length_px: float, angle_deg: float) -> Plane:
 @declare(KNOWN, "optics", ("psf",), "share of the spacing", 0.05, 0.3, sign=sign)
 def mesh_pitch(effect: Effect, optics: FineOptics, moment: Moment) -> FineOptics:
     """The pitch of the mesh, or the wavelength, differs: the distances of the mesh orders are larger, or smaller,
-    than assumed."""
+    than assumed.
+    """
     kernel = optics.glass.fine(pitch_factor=1 + effect["sign"] * effect.strength)
     return dataclasses.replace(optics, diffraction=kernel)
 

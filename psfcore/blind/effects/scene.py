@@ -114,7 +114,8 @@ def _band(fine_size: int, edge: int, b_px: float, c: float, a: float) -> Plane:
 )
 def limb_glint(effect: Effect, seen: Plane, moment: Moment) -> Plane:
     """In one pointing an edge of the baffle reflects sunlight: rays that spread from a point beyond the edge of the
-    field."""
+    field.
+    """
     if moment.shot.pointing != effect["pointing"]:
         return seen
     cos, sin = direction(effect["angle_deg"])
@@ -159,7 +160,8 @@ def saturation_fill(effect: Effect, scene: Plane, moment: Moment) -> Plane:
 @cache
 def patches(size: int, seed: int, patch: float) -> Plane:
     """A smooth random plane [y, x] with mean 0 and rms 1. patch: the size of its patches, as a fraction of the
-    field."""
+    field.
+    """
     rng = np.random.default_rng(seed)
     coarse = max(8, int(np.ceil(4 / patch)))
     drawn = gaussian_filter(rng.standard_normal((coarse, coarse)), 1.5)

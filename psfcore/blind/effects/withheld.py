@@ -97,7 +97,8 @@ def dust_release(effect: Effect, seen: Plane, lit: Plane, optics: FineOptics, mo
 )
 def groove_streak(effect: Effect, optics: FineOptics, moment: Moment) -> FineOptics:
     """Parallel grooves on a mirror scatter light into a streak: a Lorentzian across it, and a slow decrease along
-    it."""
+    it.
+    """
     along, across = turned_offsets(optics, effect["angle_deg"])
     streak = 1 / (1 + (across / effect["width_px"]) ** 2) / (1 + np.abs(along) / effect["length_px"]) ** 2
     scatter = (1 - effect.strength) * optics.scatter + effect.strength * streak / streak.sum()
@@ -166,7 +167,8 @@ def rough_rim(effect: Effect, seen: Plane, lit: Plane, optics: FineOptics, momen
 )
 def mount_arc(effect: Effect, seen: Plane, moment: Moment) -> Plane:
     """The round mount of a filter reflects light: a part of a ring, as wide as the mount is thick, on the same pixels
-    in every image."""
+    in every image.
+    """
     along, across = unit_coordinates(seen.shape, effect["angle_deg"], effect["at"])
     along = along + effect["radius"]  # from the centre of the ring; the arc passes through the point
     turn = np.arctan2(across, along) / np.deg2rad(effect["span_deg"])
@@ -214,7 +216,8 @@ def foil_creases(effect: Effect, seen: Plane, moment: Moment) -> Plane:
 @declare(TEST, "expected", ("light_time",), "DN/s", 1.0, 60.0, period=(0.25, 0.6), phase=(0.0, 1.0))
 def encoder_lamp(effect: Effect, rate: Plane, moment: Moment) -> Plane:
     """The lamp of a position encoder is lit half of the time, at regular intervals: a uniform light, a square wave in
-    time."""
+    time.
+    """
     lit = (moment.elapsed / effect["period"] + effect["phase"]) % 1 < 0.5
     return np.asarray(rate + effect.strength * lit)
 
@@ -284,7 +287,8 @@ def charge_trails(effect: Effect, dn: Plane, moment: Moment, earlier: list[Earli
 )
 def bias_settling(effect: Effect, dn: Plane, moment: Moment, earlier: list[Earlier]) -> Plane:
     """The amplifier cools while it waits: its level settles exponentially during the readout, by more after a longer
-    wait."""
+    wait.
+    """
     shots = moment.plan.shots
     wait = (moment.shot.time_s - earlier[-1].time_s) if earlier else np.inf
     cold = -np.expm1(-wait * len(shots) / max(shots[-1].time_s - shots[0].time_s, 1e-9))

@@ -62,8 +62,8 @@ Pixels = TypeVar("Pixels", NDArray[np.floating], NDArray[np.bool_])
 class Artefacts:
     """Signs of artefacts in one image.
 
-    suspected: pixels [y, x] that show a sign of Eq. (1) to (3). signs: the measured value of each sign, with the names of
-    ALARMS; ringing_pct is None if there are fewer than three bright sources. sources: number of bright sources.
+    suspected: pixels [y, x] that show a sign of Eq. (1) to (3). signs: the measured value of each sign, with the names
+    of ALARMS; ringing_pct is None if there are fewer than three bright sources. sources: number of bright sources.
     score: artefact score; 0 means no signs, and an image with a score of 1 or more should be inspected.
     """
 
@@ -82,8 +82,9 @@ def find_artefacts(
 ) -> Artefacts:
     """Find signs of artefacts in the counted pixels of `after` [y, x].
 
-    before, after: finite (`filled`), in single precision, which is accurate enough and twice as fast. sigma: function that
-    returns the noise of `before` at positions [y, x], in the unit of `before`; None: the noise is estimated from the pixels.
+    before, after: finite (`filled`), in single precision, which is accurate enough and twice as fast. sigma: function
+    that returns the noise of `before` at positions [y, x], in the unit of `before`; None: the noise is estimated from
+    the pixels.
     """
     classes = classes_of(before[counted])
     noise_after = noise_levels(after, counted, classes)
@@ -129,7 +130,8 @@ def classes_of(brightness: Plane) -> BrightnessClasses:
 class NoiseLevels:
     """The noise of pixels as a function of their brightness.
 
-    centres, levels: brightness and noise of the classes; empty: no classes. smallest: the noise is not below this value.
+    centres, levels: brightness and noise of the classes; empty: no classes. smallest: the noise is not below this
+    value.
     """
 
     centres: Plane
@@ -167,8 +169,9 @@ def _estimated_noise(pixels: Plane, counted: Flags, classes: BrightnessClasses) 
 
 
 def second_differences(plane: Plane, counted: Flags) -> Plane:
-    """The absolute second difference along both axes, divided by 6, of the counted pixels (n,); the plane is mirrored at its
-    edges. Sums are in double precision."""
+    """The absolute second difference along both axes, divided by 6, of the counted pixels (n,); the plane is mirrored
+    at its edges. Sums are in double precision.
+    """
     differences = np.empty(np.count_nonzero(counted), plane.dtype)
     first = 0
     for rows, block in _blocks_with_rim(plane, 1, "symmetric"):
@@ -246,15 +249,16 @@ def _new_extremes(before: Plane, after: Plane, noise_before: NoiseAt, noise_afte
 def _peaks(before: Plane, after: Plane, noise_after: NoiseLevels) -> dict[int, Places]:
     """The pixels that may fulfil Eq. (3): with 1 those that are the largest of 3 x 3 px, with -1 the smallest ones.
 
-    A median lies between the minimum and the maximum of its pixels. If a pixel differs from both by less than the limit, it cannot
-    fulfil Eq. (3). Medians are therefore needed only for the few pixels that are left.
+    A median lies between the minimum and the maximum of its pixels. If a pixel differs from both by less than the
+    limit, it cannot fulfil Eq. (3). Medians are therefore needed only for the few pixels that are left.
     """
     peaks: dict[int, list[Places]] = {1: [], -1: []}
     for rows, block in _blocks_with_rim(after, 2, "edge"):
         pixels, inner = block[2:-2, 2:-2], block[1:-1, 1:-1]
         for sign, nearest, farthest in ((1, np.maximum, np.minimum), (-1, np.minimum, np.maximum)):
             away = sign * (pixels - _within(block, 2, farthest))
-            # The noise is computed only where the smallest noise of all would not be enough. It is rounded differently: the factor.
+            # The noise is computed only where the smallest noise of all would not be enough. It is rounded differently:
+            # the factor.
             y, x = np.nonzero(
                 (pixels == _within(inner, 1, nearest)) & (away > 0.999 * EXTREME_SIGMA * noise_after.least)
             )
@@ -264,7 +268,9 @@ def _peaks(before: Plane, after: Plane, noise_after: NoiseLevels) -> dict[int, P
 
 
 def _maxima(plane: Pixels, radius_px: int) -> Pixels:
-    """Largest value of the square of 2 radius_px + 1 px around each pixel [y, x]; near an edge, of its part inside the plane."""
+    """Largest value of the square of 2 radius_px + 1 px around each pixel [y, x]; near an edge, of its part inside the
+    plane.
+    """
     return _extremes(plane, radius_px, np.maximum)
 
 

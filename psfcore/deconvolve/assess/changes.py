@@ -1,4 +1,5 @@
-"""What a deconvolution changed in an image, in numbers that can be compared with the paper; and the quality of its pixels.
+"""What a deconvolution changed in an image, in numbers that can be compared with the paper; and the quality of its
+pixels.
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "Effects on HRI_EUV images": "bright features
 intensify by up to 40 %, while dark regions decrease by up to 85 %". The paper does not define a feature, the number
@@ -73,8 +74,8 @@ class Structure:
 class Range:
     """Dynamic range, Eq. (2), and contrast of block means, before and after deconvolution.
 
-    Contrast is the standard deviation divided by the mean. It is None if the mean is not above zero, and a dynamic range is
-    None if the lower percentile is not.
+    Contrast is the standard deviation divided by the mean. It is None if the mean is not above zero, and a dynamic
+    range is None if the lower percentile is not.
     """
 
     block_px: int
@@ -127,9 +128,9 @@ def measure_changes(
 ) -> Changes:
     """Compare an image with its deconvolution, `result` [y, x], in the trusted pixels.
 
-    psf: the PSF with which the image was deconvolved. edge_px: width of the band at the edges that is left out.
-    noise: noise of the camera; if it is None, the artefact check estimates the noise from the pixels. threads: with 2 or
-    more, a second thread runs the artefact check. Raises DataError "field-shape", "no-signal", "no-exposure".
+    psf: the PSF with which the image was deconvolved. edge_px: width of the band at the edges that is left out. noise:
+    noise of the camera; if it is None, the artefact check estimates the noise from the pixels. threads: with 2 or more,
+    a second thread runs the artefact check. Raises DataError "field-shape", "no-signal", "no-exposure".
     """
     if result.shape != image.pixels.shape:
         raise DataError("field-shape", f"expected a result of {image.pixels.shape}; got {result.shape}")
@@ -215,7 +216,9 @@ class _Blocks:
 
 
 def _larger_blocks(before: Plane, after: Plane, counted: Flags) -> Iterator[_Blocks]:
-    """The blocks whose pixels are all counted, for each size of BLOCKS_PX above 1. The sums of a size are those of half the size, added."""
+    """The blocks whose pixels are all counted, for each size of BLOCKS_PX above 1. The sums of a size are those of half
+    the size, added.
+    """
     block_px = 1
     while block_px < BLOCKS_PX[-1]:
         with np.errstate(invalid="ignore"):  # a block with infinite pixels is not whole
@@ -330,7 +333,8 @@ def _change_pct(before: Any, after: Any) -> Any:
 
 
 class QualityBit(IntFlag):
-    """Bits of the quality plane; a pixel without a bit is good. The bits of `psfcore.image.MaskBit` have the same values.
+    """Bits of the quality plane; a pixel without a bit is good. The bits of `psfcore.image.MaskBit` have the same
+    values.
 
     A negative pixel has no bit: noise makes some dark pixels negative, and a mean over the other pixels only would be
     too large. The value 16 is not used.
@@ -388,7 +392,9 @@ def quality_plane(
 
 
 def _near(marked: NDArray[np.bool_], radius_px: int) -> NDArray[np.bool_]:
-    """Pixels [y, x] whose distance from a marked pixel is at most `radius_px`: the marked pixels, shifted by each offset."""
+    """Pixels [y, x] whose distance from a marked pixel is at most `radius_px`: the marked pixels, shifted by each
+    offset.
+    """
     ny, nx = marked.shape
     near = np.zeros_like(marked)
     reach = range(-radius_px, radius_px + 1)

@@ -18,8 +18,8 @@ pixel, 11 % at 7 photons and 19 % at 1 photon. A wider window blurs the edges in
 scatter. If the noise is added to the observation instead (y + noise), sigma is less accurate at few photons. Linear
 error propagation through the steps is wrong by a factor of up to 3 at few photons.
 
-A correction takes account of the scatter of sigma. The scatter of W(d_k^2 / n) between realisations gives the degrees of
-freedom nu by Satterthwaite's rule (1946). The root of a variance is too small on average, by the factor c4 for nu
+A correction takes account of the scatter of sigma. The scatter of W(d_k^2 / n) between realisations gives the degrees
+of freedom nu by Satterthwaite's rule (1946). The root of a variance is too small on average, by the factor c4 for nu
 degrees of freedom; therefore sigma is divided by c4.
 
 The error from the uncertainty of the PSF is the standard deviation over deconvolutions with several PSFs, the sigma
@@ -91,9 +91,10 @@ def error_planes(
 ) -> ErrorPlanes:
     """Compute the error plane of `run(image)`. `run` deconvolves an image of this shape and mask with any method.
 
-    conditions: with the noise of the camera, and the threads; progress(done, of) is called after each run, and its exceptions are
-    not caught. estimate: run(image). draws: number of noise realisations, 2 or more. edge_px: width of the band at the edges
-    that is left out of the amplification. The same seed gives the same planes. Raises DataError "bad-draws", "no-exposure".
+    conditions: with the noise of the camera, and the threads; progress(done, of) is called after each run, and its
+    exceptions are not caught. estimate: run(image). draws: number of noise realisations, 2 or more. edge_px: width of
+    the band at the edges that is left out of the amplification. The same seed gives the same planes. Raises DataError
+    "bad-draws", "no-exposure".
     """
     if draws < SMALLEST_DRAWS:
         raise DataError("bad-draws", f"expected at least {SMALLEST_DRAWS} noise realisations; got {draws}")

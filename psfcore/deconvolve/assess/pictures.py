@@ -1,9 +1,11 @@
-"""Show what deconvolution changed: a page with six panels for one image; numbers and a sheet of thumbnails for many images.
+"""Show what deconvolution changed: a page with six panels for one image; numbers and a sheet of thumbnails for many
+images.
 
-Hofmeister et al., The point-spread function of HRI_EUV, section "Effects on HRI_EUV images", deconvolved a catalogue
-at a daily cadence "to visually inspect for artifacts". This module sorts the images by artefact score, so that a person
+Hofmeister et al., The point-spread function of HRI_EUV, section "Effects on HRI_EUV images", deconvolved a catalogue at
+a daily cadence "to visually inspect for artifacts". This module sorts the images by artefact score, so that a person
 inspects the most doubtful images first. Only thumbnails of the images are kept in memory. The images are deconvolved
-elsewhere: `changes_in_product` reads the numbers from the details of a product, and the suspected pixels from its plane QUALITY.
+elsewhere: `changes_in_product` reads the numbers from the details of a product, and the suspected pixels from its plane
+QUALITY.
 """
 
 from __future__ import annotations
@@ -150,8 +152,8 @@ def _largest(plane: Plane) -> float:
 class Treated:
     """One deconvolved image.
 
-    taken: date of the observation. changes: the measured changes, as `Changes.as_json` gives them. before, after: thumbnails [y, x]. suspected: positions
-    [y, x] of the thumbnail pixels with suspected artefacts, shape (n, 2).
+    taken: date of the observation. changes: the measured changes, as `Changes.as_json` gives them. before, after:
+    thumbnails [y, x]. suspected: positions [y, x] of the thumbnail pixels with suspected artefacts, shape (n, 2).
     """
 
     name: str
@@ -170,7 +172,9 @@ class Treated:
         return float(self.changes["artefacts"]["score"])
 
     def structure(self, kind: str) -> dict[str, float] | None:
-        """Change of the bright or dark blocks: sum_pct and up_to_pct of `Structure`; None if there are no such blocks."""
+        """Change of the bright or dark blocks: sum_pct and up_to_pct of `Structure`; None if there are no such
+        blocks.
+        """
         for row in self.changes["structures"]:
             if (row["kind"], row["block_px"], row["tail_pct"]) == (kind, BLOCK_PX, TAIL_PCT):
                 return {"sum_pct": row["sum_pct"], "up_to_pct": row["up_to_pct"]}
@@ -231,7 +235,8 @@ def treat_many(
     *,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> tuple[list[Treated], list[Failure]]:
-    """Deconvolve many images. Returns the results, with the highest score first, and the failures in the order of `names`.
+    """Deconvolve many images. Returns the results, with the highest score first, and the failures in the order of
+    `names`.
 
     one(name) reads and deconvolves one image. If it raises DataError or OSError, the image becomes a `Failure`, and the
     next image follows.
@@ -358,7 +363,8 @@ def _short(name: str) -> str:
 
 def _summary(treated: Sequence[Treated], failures: Sequence[Failure]) -> dict[str, Any]:
     """Summary of all images: the number of images that a person should inspect, and medians and extremes of the
-    changes."""
+    changes.
+    """
     out: dict[str, Any] = {
         "images": len(treated),
         "failures": len(failures),

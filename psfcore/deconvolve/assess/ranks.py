@@ -1,8 +1,8 @@
 """Values of given ranks among millions of numbers, faster than by a sort or a partition.
 
-The bits of a float32, read as an integer, order the numbers above 0 by their values and those below 0 in reverse; with the latter
-turned around, this integer is called the key. A histogram of the upper 16 bits of the keys tells in which bin each rank lies. Only
-the values in these bins, usually a few percent of all, are sorted.
+The bits of a float32, read as an integer, order the numbers above 0 by their values and those below 0 in reverse; with
+the latter turned around, this integer is called the key. A histogram of the upper 16 bits of the keys tells in which
+bin each rank lies. Only the values in these bins, usually a few percent of all, are sorted.
 """
 
 from __future__ import annotations
@@ -22,7 +22,9 @@ _LARGEST = float(np.finfo(np.float32).max)
 
 
 def percentiles(values: NDArray[np.generic], levels: Sequence[float]) -> NDArray[np.float64]:
-    """The percentiles of values (n,), which must not be NaN, as `numpy.percentile` computes them, in single precision."""
+    """The percentiles of values (n,), which must not be NaN, as `numpy.percentile` computes them, in single
+    precision.
+    """
     with np.errstate(over="ignore"):
         single = np.asarray(values, dtype=np.float32)
     place = (single.size - 1) * np.asarray(levels) / 100
@@ -35,7 +37,9 @@ def percentiles(values: NDArray[np.generic], levels: Sequence[float]) -> NDArray
 
 
 def medians(values: Values, groups: Groups, count: int) -> NDArray[np.float64]:
-    """The median of the values (n,) of each of `count` groups. groups: the number of the group of each value; none is empty."""
+    """The median of the values (n,) of each of `count` groups. groups: the number of the group of each value; none is
+    empty.
+    """
     if count == 0:
         return np.empty(0)
     sizes = np.bincount(groups, minlength=count)
@@ -59,7 +63,9 @@ def parts_of_equal_size(values: Values, count: int) -> Groups:
 def _at_ranks(
     values: Values, groups: Groups, ranks: Sequence[Sequence[int]]
 ) -> list[tuple[Values, NDArray[np.int64]]]:
-    """For each group: the values that stand at these ranks (from 0) of its sorted values, and how many of its values are smaller."""
+    """For each group: the values that stand at these ranks (from 0) of its sorted values, and how many of its values
+    are smaller.
+    """
     counts = np.zeros((len(ranks), _BINS), np.int64)
     _count(values, groups, counts)
     below = np.cumsum(counts, axis=1)
@@ -115,7 +121,9 @@ def _collect(
 
 @compiled()
 def _cut(values: Values, borders: Values, lower: NDArray[np.int64], parts: Groups) -> None:
-    """Write the part of each value: the number of borders below it. lower: how many values that equal a border are below it."""
+    """Write the part of each value: the number of borders below it. lower: how many values that equal a border are
+    below it.
+    """
     bits, equal = values.view(np.int32), np.zeros(borders.size, np.int64)
     first = np.zeros(_BINS, np.uint8)  # the number of borders in lower bins
     for bit in borders.view(np.int32):

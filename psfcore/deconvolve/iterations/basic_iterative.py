@@ -5,9 +5,9 @@
 The paper recommends this method for a bright source near an edge. Eq. (1) converges to H x = y even if H moves light
 out of the field. The method therefore restores the part of a pixel's light that falls outside the field. The method
 must also take account of the light that enters from outside. If the scene is assumed to be zero beyond the field, the
-pixels along the edge become a third too bright (measured with simulated scenes). Therefore, by default, the mirror image of
-the field continues the scene beyond the field. If the field is much smaller than the PSF, the margin makes it possible
-to use the whole PSF.
+pixels along the edge become a third too bright (measured with simulated scenes). Therefore, by default, the mirror
+image of the field continues the scene beyond the field. If the field is much smaller than the PSF, the margin makes it
+possible to use the whole PSF.
 
 The method is linear: negative pixels are used unchanged, and the result may be negative. A masked pixel (w = 0) keeps
 its first estimate. Let T be the Fourier transform of the PSF at one frequency. After n steps, the noise at this
@@ -45,7 +45,9 @@ LARGEST_GROWTH = 10.0
 
 
 def solve(problem: Problem) -> Deconvolved:
-    """The result of Eq. (1), with its noise amplification. Raises DataError "method-diverges" if abs(1 - T) is too large."""
+    """The result of Eq. (1), with its noise amplification. Raises DataError "method-diverges" if abs(1 - T) is too
+    large.
+    """
     sample = transfer_sample(problem.engine)
     _check_converges(sample, problem.steps)
     result = problem.solve(BasicIterative(problem))
@@ -71,7 +73,8 @@ class BasicIterative(LinearIteration):
 
 def _check_converges(sample: TransferSample, steps: int) -> None:
     """Raise DataError "method-diverges" if `steps` steps with G = 1 can increase an error by more than
-    LARGEST_GROWTH."""
+    LARGEST_GROWTH.
+    """
     worst = float(np.abs(1 - sample.values).max())
     if worst > 1 and steps * np.log(worst) > np.log(LARGEST_GROWTH):
         advice = "use richardson-lucy or linear, or fewer steps"

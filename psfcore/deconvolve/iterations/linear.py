@@ -122,7 +122,7 @@ def _all_rows(engine: Engine) -> int:
 def solve_linear(
     engine: Engine, step_filter: NDArray[np.float32], observed: Single, start: Single, steps: int
 ) -> Single:
-    """x after some steps of Eq. (1), for an observation whose pixels are all trusted; in the engine's layout.
+    """X after some steps of Eq. (1), for an observation whose pixels are all trusted; in the engine's layout.
 
     start: the first estimate. The scene is dark beyond the edges of the field. step_filter: as for `Additive`.
     """
@@ -204,7 +204,9 @@ def _residual_rows(
 def _add_rows(
     lines: Lines, start: int, stop: int, x: Single, again: bool, changes: NDArray[np.float64], rows: int
 ) -> None:
-    """Compute x <- x + G w (y - H x), Eq. (1). Add up (change)^2 and x^2 for each block. x is 0 beyond the number of rows."""
+    """Compute x <- x + G w (y - H x), Eq. (1). Add up (change)^2 and x^2 for each block. x is 0 beyond the number of
+    rows.
+    """
     nx = x.shape[1]
     zero = np.float32(0.0)
     for block in range(start, stop):

@@ -49,8 +49,8 @@ from psfcore.deconvolve.problem import (
 from psfcore.errors import DataError
 
 # Smallest value of a model pixel, as a fraction of the brightest pixel (the "floor"). The floor is the resolution of
-# float32; smaller values are dominated by the rounding of the transform. The floor also avoids denormal numbers, which are
-# slow.
+# float32; smaller values are dominated by the rounding of the transform. The floor also avoids denormal numbers, which
+# are slow.
 FLOOR_OF_MAXIMUM = 2.0**-23
 # An estimate below this fraction of the floor is set to 0.
 DARK_OF_FLOOR = 1e-6
@@ -129,7 +129,8 @@ def _ratio_rows(
     lines: Lines, start: int, stop: int, light: Single, floor: np.float32, judgement: Judgement
 ) -> None:
     """Replace H x, raised to `floor` where it is smaller, by Eq. (2). Add up (y - H x)^2 / variance over the judged
-    pixels."""
+    pixels.
+    """
     nx, judged = light.shape[1], judgement.rows
     zero, least = np.float32(0.0), np.float32(1e-30)
     for block in range(start, stop):

@@ -29,7 +29,9 @@ _MOST_ACCELERATION = 0.999
 
 
 class Accelerated(LucyIteration):
-    """The iteration of Eq. (1) to (3). Its `x` is the prediction, which `measure` convolves; after the last step it is x."""
+    """The iteration of Eq. (1) to (3). Its `x` is the prediction, which `measure` convolves; after the last step it is
+    x.
+    """
 
     def __init__(self, problem: Problem, order: int) -> None:
         estimate = light_above_floor(problem)

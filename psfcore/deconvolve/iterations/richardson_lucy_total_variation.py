@@ -37,7 +37,8 @@ SOFTENING = 0.1
 
 class TotalVariation(LucyIteration):
     """The iteration of Eq. (1). x is a plane [y, x], because the differences connect pixels of different blocks of the
-    engine."""
+    engine.
+    """
 
     def __init__(self, problem: Problem, smoothing: float) -> None:
         self.x = light_above_floor(problem)
@@ -69,7 +70,7 @@ class TotalVariation(LucyIteration):
 
 @compiled()
 def _direction(x: Single, row: int, column: int, softening: np.float32) -> tuple[np.float32, np.float32]:
-    """grad x / |grad x| at a pixel, (along y, along x). Differences beyond the last row and column count as 0."""
+    """Grad x / |grad x| at a pixel, (along y, along x). Differences beyond the last row and column count as 0."""
     zero = np.float32(0.0)
     here = x[row, column]
     dy = x[row + 1, column] - here if row + 1 < x.shape[0] else zero

@@ -1,4 +1,6 @@
-"""Richardson-Lucy with total variation; `psfcore.deconvolve.iterations.richardson_lucy_total_variation` has the equations."""
+"""Richardson-Lucy with total variation; `psfcore.deconvolve.iterations.richardson_lucy_total_variation` has the
+equations.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Decodes planes of FITS files for a viewer, and keeps them for some time for the many requests of a viewer.
 
-A plane is decoded in a process of its own. Its values are those of the file after BSCALE, BZERO and BLANK are applied. No
-pixel is divided by the exposure time or masked.
+A plane is decoded in a process of its own. Its values are those of the file after BSCALE, BZERO and BLANK are applied.
+No pixel is divided by the exposure time or masked.
 
 A decoded plane is stored in a file without a name in the folder of temporary files. The plane is not kept as an array
 in memory, because many slow clients may read different planes at the same time. The system's page cache keeps the
@@ -122,7 +122,9 @@ def decode_plane(path: str | Path, name: str, limits: FitsLimits, target: Binary
 
 
 def write_pixels(target: BinaryIO, *, path: str, hdu: int | None, limits: dict[str, int]) -> dict[str, Any]:
-    """Write the pixels of an image to ``target`` as little-endian float32; returns its unit. Call it in a limited process."""
+    """Write the pixels of an image to ``target`` as little-endian float32; returns its unit. Call it in a limited
+    process.
+    """
     from psfcore.fits.hdus import ascii_text, read_pixels  # loads the numerical libraries
 
     stored = read_pixels(path, FitsLimits(**limits), hdu=hdu)
@@ -138,6 +140,7 @@ def _number_of_plane(path: str | Path, name: str, limits: FitsLimits) -> int:
         advice = ": submit the deconvolution with error_draws" if name == "ERROR" else ""
         raise DataError(
             "no-such-plane",
-            f"expected a plane of this file ({', '.join([IMAGE, *map(str.lower, planes)])}); got {name.lower()}{advice}",
+            f"expected a plane of this file ({', '.join([IMAGE, *map(str.lower, planes)])}); got "
+            f"{name.lower()}{advice}",
         )
     return planes[name]

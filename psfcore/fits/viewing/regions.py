@@ -1,12 +1,12 @@
 """Cut a circle, a box or a polygon out of a product, as a FITS file with the image and its planes.
 
-The cut-out is the smallest rectangle of whole pixels that contains the region. Its pixels are those of the product; pixels of
-the rectangle outside the region are kept. The reference pixels (CRPIX) of all coordinate systems are moved, so each
-pixel keeps its place on the sky.
+The cut-out is the smallest rectangle of whole pixels that contains the region. Its pixels are those of the product;
+pixels of the rectangle outside the region are kept. The reference pixels (CRPIX) of all coordinate systems are moved,
+so each pixel keeps its place on the sky.
 
 Positions are in pixels, counted from 0 at the centre of the first pixel, or helioprojective (arcsec), which the header
-converts (W. T. Thompson, A&A 449, 791, 2006). The edges of a region are sampled at EDGE points, because a straight line or a
-circle on the sky need not be one on the detector.
+converts (W. T. Thompson, A&A 449, 791, 2006). The edges of a region are sampled at EDGE points, because a straight line
+or a circle on the sky need not be one on the detector.
 """
 
 from __future__ import annotations
@@ -77,8 +77,8 @@ class Region:
 def write_cutout(path: str | Path, region: Region, limits: FitsLimits, target: BinaryIO) -> None:
     """Write the cut-out of a product to ``target``, in a process of its own.
 
-    Raises HeaderError for an unusable header, and DataError "region-outside" if the region contains no pixel of the image,
-    "no-helioprojective" if the header gives no helioprojective coordinates, and "unreadable-pixels".
+    Raises HeaderError for an unusable header, and DataError "region-outside" if the region contains no pixel of the
+    image, "no-helioprojective" if the header gives no helioprojective coordinates, and "unreadable-pixels".
     """
     image = first_image(iter(all_hdus(path, limits)), limits)
     run_limited(
@@ -100,7 +100,8 @@ def cut_out(target: BinaryIO, *, path: str, frame: Frame, edge: list[list[float]
         planes = [hdu for hdu in hdus[1:] if isinstance(hdu, fits.ImageHDU) and hdu.shape == (ny, nx)]
         parts = [_cut(hdu, columns, rows) for hdu in (image, *planes)]
         parts[0].header.add_history(
-            f"heliopsf: columns {columns.start} to {columns.stop - 1}, rows {rows.start} to {rows.stop - 1} (counted from 0) of "
+            f"heliopsf: columns {columns.start} to {columns.stop - 1}, rows {rows.start} to {rows.stop - 1} (counted "
+            "from 0) of "
             f"{nx} x {ny} px"
         )
         fits.HDUList(parts).writeto(target, checksum=True)
@@ -121,7 +122,8 @@ def _window(region: Region, header: fits.Header, shape: tuple[int, int]) -> tupl
         box = ", ".join(f"{points[:, axis].min():.1f} to {points[:, axis].max():.1f}" for axis in (0, 1))
         raise DataError(
             "region-outside",
-            f"expected a region with pixels of the image, {nx} x {ny} px; got a region at x and y {box} px: move the region",
+            f"expected a region with pixels of the image, {nx} x {ny} px; got a region at x and y {box} px: move the "
+            "region",
         )
     return parts[0], parts[1]
 
@@ -144,7 +146,8 @@ def _pixels_of(points: Points, header: fits.Header) -> Points:
     if not np.isfinite(pixels).all():
         raise DataError(
             "region-outside",
-            "expected a region that the image's coordinates can show; got one partly beyond them: move it, or make it smaller",
+            "expected a region that the image's coordinates can show; got one partly beyond them: move it, or make it "
+            "smaller",
         )
     return pixels
 

@@ -61,7 +61,8 @@ def window_of(
     if not (0 <= x < x + width <= nx and 0 <= y < y + height <= ny):
         raise DataError(
             "window-outside",
-            f"expected a window inside the plane of {nx} x {ny} px: x + width at most {nx}, y + height at most {ny}; got x {x}, "
+            f"expected a window inside the plane of {nx} x {ny} px: x + width at most {nx}, y + height at most {ny}; "
+            f"got x {x}, "
             f"y {y}, width {width}, height {height}",
         )
     return Window(x, y, width, height, step)

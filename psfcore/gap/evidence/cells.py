@@ -1,9 +1,9 @@
 """The cells of a disc: mean residuals in sectors of rings, and their response to any change of the image.
 
-Let y be an image and D the mask of its fully dark pixels. H is the PSF, and G is the inverse of H on the periodic plane.
-The reconstructed scene is x = (2 - G H) G y. The residual in the disc is r = D [y - H (1 - D) x]. A cell is a sector of a ring
-of the disc. The mean of r over a cell is a linear function of the whole image. The adjoint of H and G gives the weights q
-of this function in one pass:
+Let y be an image and D the mask of its fully dark pixels. H is the PSF, and G is the inverse of H on the periodic
+plane. The reconstructed scene is x = (2 - G H) G y. The residual in the disc is r = D [y - H (1 - D) x]. A cell is a
+sector of a ring of the disc. The mean of r over a cell is a linear function of the whole image. The adjoint of H and G
+gives the weights q of this function in one pass:
 
     a . r = q . y,   q = a - (2 - G^T H^T) G^T (1 - D) H^T a        Eq. (1)
 
@@ -44,8 +44,8 @@ LEAST_VARIANCE = 1e-12
 class Cells:
     """The cells of one disc.
 
-    weights: (cells, dark pixels). pixels: number of pixels of each cell. radius: mean radius of each cell, divided by the
-    radius of the outermost dark pixel. azimuth: mean azimuth of each cell, rad.
+    weights: (cells, dark pixels). pixels: number of pixels of each cell. radius: mean radius of each cell, divided by
+    the radius of the outermost dark pixel. azimuth: mean azimuth of each cell, rad.
     """
 
     weights: Matrix
@@ -108,12 +108,12 @@ def whitening(covariance: Matrix) -> Matrix:
 class DiscCells:
     """The cells of one disc: their residuals and the derivatives of these residuals.
 
-    index: the number of the frame among all frames. residual: observed minus expected (cells,), DN/s. expected: the light that
-    the model predicts (cells,), DN/s. covariance: Eq. (2). jacobian: (columns, cells), DN/s for one unit of a parameter.
-    pixels, radius, azimuth: as in `Cells`. boxes: the sensitivities of the cells, and these times the expected image, each
-    summed over boxes of the detector (2, cells, rows, columns). scene: the mean of the occulted scene in each box [y, x],
-    DN/s. level_before: the value of `level` before the light of an effect was
-    subtracted from the image, DN/s; None if nothing was subtracted.
+    index: the number of the frame among all frames. residual: observed minus expected (cells,), DN/s. expected: the
+    light that the model predicts (cells,), DN/s. covariance: Eq. (2). jacobian: (columns, cells), DN/s for one unit of
+    a parameter. pixels, radius, azimuth: as in `Cells`. boxes: the sensitivities of the cells, and these times the
+    expected image, each summed over boxes of the detector (2, cells, rows, columns). scene: the mean of the occulted
+    scene in each box [y, x], DN/s. level_before: the value of `level` before the light of an effect was subtracted from
+    the image, DN/s; None if nothing was subtracted.
     """
 
     index: int
@@ -200,7 +200,8 @@ def summed_over_boxes(planes: Planes) -> Planes:
 
 def coarse_kernel(kernel: Matrix, step: int) -> Matrix:
     """A kernel [y, x], binned: each coarse pixel is the sum of `step` x `step` pixels. Its centre is in the
-    middle of a coarse pixel."""
+    middle of a coarse pixel.
+    """
     middle = kernel.shape[0] // 2
     reach = (middle + step // 2) // step
     at = (np.arange(kernel.shape[0]) - middle + step // 2) // step + reach

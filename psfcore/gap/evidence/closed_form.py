@@ -2,29 +2,32 @@
 
     y = B beta + sum over causes of A_k c_k + noise,     c_k ~ Normal(0, W_k^2)                          Eq. (1)
 
-y are the residuals in the cells of the discs and the levels of the unocculted blocks, in units of their noise. beta are the
-coordinates of the PSF, without a prior; in the blocks, the scene of each pointing (no prior) and the brightness of each image
-(the prior of `unocculted_blocks`) are free too. A_k are the columns of a cause: an effect of the library, or a field (`columns`).
-With beta, scene and brightness eliminated, let N be the normal matrix and s the score. For the columns of some causes
+y are the residuals in the cells of the discs and the levels of the unocculted blocks, in units of their noise. beta are
+the coordinates of the PSF, without a prior; in the blocks, the scene of each pointing (no prior) and the brightness of
+each image (the prior of `unocculted_blocks`) are free too. A_k are the columns of a cause: an effect of the library, or
+a field (`columns`). With beta, scene and brightness eliminated, let N be the normal matrix and s the score. For the
+columns of some causes
 
     ln E = s^T (N + W^-2)^-1 s / 2 - ln det(1 + W N W) / 2                                               Eq. (2)
 
-relative to no cause (the Bayesian linear model; Rasmussen and Williams 2006, section 2.7). A prior has several variants, and the
-evidence is their mean: the size of the coefficients is one of a few multiples of the likely size; a field with bumps on the
-detector may act everywhere, or in one square of neighbouring bumps. A parameter that cannot be negative has half a Gaussian as
-prior: if its best value is negative, it is left out; otherwise ln E gains ln 2 Phi(value / error). If the template of an effect
-was chosen among many, the logarithm of the number that the data distinguish is subtracted.
+relative to no cause (the Bayesian linear model; Rasmussen and Williams 2006, section 2.7). A prior has several
+variants, and the evidence is their mean: the size of the coefficients is one of a few multiples of the likely size; a
+field with bumps on the detector may act everywhere, or in one square of neighbouring bumps. A parameter that cannot be
+negative has half a Gaussian as prior: if its best value is negative, it is left out; otherwise ln E gains ln 2
+Phi(value / error). If the template of an effect was chosen among many, the logarithm of the number that the data
+distinguish is subtracted.
 
-**The Sun** changes each block by its own amount: relative to its light, by a random sum of polynomials in time. It is a cause, with
-the sizes SUN_SIZES of this sum (in units of the scale of the noise) and the two courses SUN_COURSES. Its coefficients are
-eliminated block by block, so N with the Sun in the model costs one product of matrices.
+**The Sun** changes each block by its own amount: relative to its light, by a random sum of polynomials in time. It is a
+cause, with the sizes SUN_SIZES of this sum (in units of the scale of the noise) and the two courses SUN_COURSES. Its
+coefficients are eliminated block by block, so N with the Sun in the model costs one product of matrices.
 
-**Errors of form.** No linear column is exact. If the change by the most probable causes is so strong that a relative error
-FORM_ERROR of it would be visible, this error joins the noise: common to the cells of a disc, or the blocks of an image, and
-for each cell and block on its own. In the blocks, the square of a relative change joins it too. It is the same for all hypotheses.
+**Errors of form.** No linear column is exact. If the change by the most probable causes is so strong that a relative
+error FORM_ERROR of it would be visible, this error joins the noise: common to the cells of a disc, or the blocks of an
+image, and for each cell and block on its own. In the blocks, the square of a relative change joins it too. It is the
+same for all hypotheses.
 
-**Noise.** If the best causes leave more chi2 than noise does, the variance of the noise of the discs, and that of the blocks, is raised
-to this ratio (Birge 1932, Phys. Rev. 40, 207).
+**Noise.** If the best causes leave more chi2 than noise does, the variance of the noise of the discs, and that of the
+blocks, is raised to this ratio (Birge 1932, Phys. Rev. 40, 207).
 """
 
 from __future__ import annotations
@@ -64,10 +67,10 @@ VISIBLE = 0.5  # errors of form count if they would add this much to chi2
 class Form:
     """One form of a cause: an effect of the library, a field, or the Sun, which has no columns.
 
-    family: its name in `tree.FAMILIES`, or that of an added effect. effect: the name of the library for this form; None if it has none.
-    columns: the numbers of its columns. likely: their likely sizes. positive: whether they cannot be negative. squares: groups of
-    its coefficients that can act without the others. everywhere: whether all of them can act together. log_templates: ln of the number of
-    templates that the data distinguish.
+    family: its name in `tree.FAMILIES`, or that of an added effect. effect: the name of the library for this form; None
+    if it has none. columns: the numbers of its columns. likely: their likely sizes. positive: whether they cannot be
+    negative. squares: groups of its coefficients that can act without the others. everywhere: whether all of them can
+    act together. log_templates: ln of the number of templates that the data distinguish.
     """
 
     family: str
@@ -100,8 +103,9 @@ class Form:
 
 @dataclass(frozen=True, eq=False)
 class Variant:
-    """One prior of a form. part: the coefficients that may differ from 0. scale: their size, in units of the likely size. cost: -ln
-    of the prior probability of the variant."""
+    """One prior of a form. part: the coefficients that may differ from 0. scale: their size, in units of the likely
+    size. cost: -ln of the prior probability of the variant.
+    """
 
     form: Form
     part: Columns
@@ -136,7 +140,9 @@ class Inexact:
 
 @dataclass(frozen=True, eq=False)
 class _Sums:
-    """Sums over the blocks. normal: (shown, shown). score: (shown, data). chi2: (data,). log_det: ln det of the covariance that the Sun adds."""
+    """Sums over the blocks. normal: (shown, shown). score: (shown, data). chi2: (data,). log_det: ln det of the
+    covariance that the Sun adds.
+    """
 
     normal: Matrix
     score: Matrix
@@ -148,8 +154,8 @@ class ClosedForm:
     """The evidence of causes for the data of a linear model.
 
     columns: the columns of its fields. inexact: the causes whose errors of form join the noise. draws: further data
-    (discs: (cells, draws), blocks: (images, blocks, draws), DN/s in blocks and units of the noise in cells) that take the place of
-    the data of the model; every ln E is then an array (draws,).
+    (discs: (cells, draws), blocks: (images, blocks, draws), DN/s in blocks and units of the noise in cells) that take
+    the place of the data of the model; every ln E is then an array (draws,).
     """
 
     def __init__(
@@ -201,7 +207,9 @@ class ClosedForm:
     # --- sums ----------------------------------------------------------------------------------------------
 
     def _of_discs(self) -> tuple[Matrix, Matrix]:
-        """The columns and the data of all cells, in units of the noise, without the part that a change of the PSF absorbs."""
+        """The columns and the data of all cells, in units of the noise, without the part that a change of the PSF
+        absorbs.
+        """
         model, base = self.model, len(self.model.evidence.base)
         fields = np.concatenate([self.columns.discs(field) for field in self.spans], axis=2)
         discs = zip(model.discs, fields, strict=True)
@@ -229,7 +237,9 @@ class ClosedForm:
         return whole - basis @ (basis.T @ whole), values - basis @ (basis.T @ values)
 
     def _of_blocks(self) -> tuple[dict[Sun | None, _Sums], int]:
-        """The sums over the blocks without the Sun (None) and with each Sun; and the number of values minus that of scenes."""
+        """The sums over the blocks without the Sun (None) and with each Sun; and the number of values minus that of
+        scenes.
+        """
         model, blocks = self.model, self.model.evidence.unocculted
         images, data = blocks.levels.shape[0], 1 if self._draws is None else self._draws[1].shape[-1]
         shown, size = self._shown, self._shown.size
@@ -312,7 +322,9 @@ class ClosedForm:
         return out
 
     def _sun_of(self, images: Columns, means: Matrix, weight: Matrix) -> dict[str, Matrix]:
-        """For each course: the change of the blocks of these images by each polynomial (images, blocks, polynomials), in units of the noise."""
+        """For each course: the change of the blocks of these images by each polynomial (images, blocks, polynomials),
+        in units of the noise.
+        """
         times = np.array([self.model.evidence.image_info[n].time_s for n in images])
         at = 2 * (times - times.min()) / max(float(np.ptp(times)), 1e-9) - 1
         out = {}
@@ -340,7 +352,7 @@ class ClosedForm:
     def score(
         self, columns: Columns, sun: Sun | None = None, misfit: tuple[float, float] | None = None
     ) -> Matrix:
-        """s of some columns (columns, data)."""
+        """S of some columns (columns, data)."""
         of_discs, of_blocks = misfit or self.misfit
         out = self._discs[:, columns].T @ self._values / of_discs
         shown = np.flatnonzero(self._place[columns] >= 0)
@@ -352,12 +364,14 @@ class ClosedForm:
         self._blocks = {None: self._blocks[None]}
 
     def of_sun(self, sun: Sun | None) -> Vector:
-        """ln E of the Sun alone, relative to no cause (data,)."""
+        """Ln E of the Sun alone, relative to no cause (data,)."""
         fall = (self._blocks[None].chi2 - self._blocks[sun].chi2) / self.misfit[1]
         return np.asarray((fall - self._blocks[sun].log_det) / 2)
 
     def of_form(self, form: Form) -> tuple[Vector, Variant | None]:
-        """ln E of one form alone, relative to no cause (data,), and its best variant for the first data (None for the Sun)."""
+        """Ln E of one form alone, relative to no cause (data,), and its best variant for the first data (None for the
+        Sun).
+        """
         if form.is_sun:
             return self.together([], SUNS), None
         # The squares have the same number of coefficients, so they are computed in one stack.
@@ -370,7 +384,7 @@ class ClosedForm:
         return logsumexp(whole, axis=0), [*alone, *squares][int(np.argmax(whole[:, 0]))]
 
     def _of_squares(self, squares: Sequence[Variant]) -> Matrix:
-        """ln E of variants with the same number of columns, of any sign, minus their cost (variants, data)."""
+        """Ln E of variants with the same number of columns, of any sign, minus their cost (variants, data)."""
         form = squares[0].form
         normal, score = self.normal(form.columns), self.score(form.columns)
         parts = np.array([one.part for one in squares])
@@ -383,7 +397,7 @@ class ClosedForm:
         return np.asarray((z**2).sum(axis=1) / 2 - (log_det + cost)[:, None])
 
     def together(self, variants: Sequence[Variant], suns: Sequence[Sun | None] = (None,)) -> Vector:
-        """ln E of variants that act together, relative to no cause (data,): the mean over these Suns."""
+        """Ln E of variants that act together, relative to no cause (data,): the mean over these Suns."""
         each = np.array([self._log_evidence(variants, sun) for sun in suns])
         return np.asarray(logsumexp(each, axis=0) - math.log(len(each)) - sum(one.cost for one in variants))
 
@@ -411,7 +425,9 @@ class ClosedForm:
                 return np.full(found.shape, -np.inf)
 
     def fitted(self, variants: Sequence[Variant], sun: Sun | None = None) -> tuple[Vector, Matrix]:
-        """Values and covariance of all columns of these variants, fitted together to the first data; a parameter with the wrong sign is 0."""
+        """Values and covariance of all columns of these variants, fitted together to the first data; a parameter with
+        the wrong sign is 0.
+        """
         columns, width, positive, _ = _joined(variants)
         normal, score = self.normal(columns, sun), self.score(columns, sun)[:, 0]
         keep = np.ones(columns.size, np.bool_)

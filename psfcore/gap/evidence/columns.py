@@ -1,7 +1,7 @@
 """The columns of the free fields: what a change of unknown form does to the discs and to the unocculted blocks.
 
-A field is an operator times a modulation (`tree` lists them). The operator is one step of the light; the modulation says how
-the change depends on place, time, pointing, or kind of image. A column is one coefficient of the field.
+A field is an operator times a modulation (`tree` lists them). The operator is one step of the light; the modulation
+says how the change depends on place, time, pointing, or kind of image. A column is one coefficient of the field.
 
 | operator | change of image n at the place x, with the bumps b(x) |
 |---|---|
@@ -16,18 +16,20 @@ the change depends on place, time, pointing, or kind of image. A column is one c
 | outside | light of b(side) beside the field, convolved with the PSF |
 | edge | E and R times 1 and the patterns of `DiscCells.patterns`, in the discs alone; R is the scene around the disc |
 
-L is the mean light of the discs, DN/s; t_n is the exposure time and 1 / T the mean of 1 / t_n; E_n is the expected image; r and
-a are the radius and the azimuth in the PSF; * is the convolution. Bumps are Gaussians on a grid, of the width w in units of half
-the detector; k(r) are Gaussians in the logarithm of the radius, half an octave wide. A change e of the image changes a cell with
-the sensitivity q by q . e (`cells`), summed over boxes of the detector that are much smaller than a bump.
+L is the mean light of the discs, DN/s; t_n is the exposure time and 1 / T the mean of 1 / t_n; E_n is the expected
+image; r and a are the radius and the azimuth in the PSF; * is the convolution. Bumps are Gaussians on a grid, of the
+width w in units of half the detector; k(r) are Gaussians in the logarithm of the radius, half an octave wide. A change
+e of the image changes a cell with the sensitivity q by q . e (`cells`), summed over boxes of the detector that are much
+smaller than a bump.
 
-In the unocculted blocks all images of a pointing share the scene: a change of the PSF there acts on the mean scene of the pointing,
-because the scene of each image contains the changes of the Sun itself. The columns of all images therefore are
+In the unocculted blocks all images of a pointing share the scene: a change of the PSF there acts on the mean scene of
+the pointing, because the scene of each image contains the changes of the Sun itself. The columns of all images
+therefore are
 
     column(n, place; form, k) = S(pointing of n, place; form) size_n W(n; k)                              Eq. (1)
 
-with the response S of the operator to one coefficient, its size_n in image n, and the modulation W. In a disc, S belongs to
-the image.
+with the response S of the operator to one coefficient, its size_n in image n, and the modulation W. In a disc, S
+belongs to the image.
 """
 
 from __future__ import annotations
@@ -80,8 +82,8 @@ _FACTORS: tuple[Callable[[Matrix], Matrix], ...] = (
 class Responses:
     """The response S of Eq. (1) of one operator.
 
-    discs: (discs, cells, forms), DN/s, padded with zeros for discs with fewer cells. blocks: for each pointing (blocks, forms), DN/s;
-    zero if the operator does not reach the blocks. size: size_n of each image (images,).
+    discs: (discs, cells, forms), DN/s, padded with zeros for discs with fewer cells. blocks: for each pointing (blocks,
+    forms), DN/s; zero if the operator does not reach the blocks. size: size_n of each image (images,).
     """
 
     discs: Matrix
@@ -134,7 +136,9 @@ class FieldColumns:
         return int(self._responses(field).discs.shape[2] * self._modulation(field).shape[1])
 
     def squares(self, field: Field) -> list[NDArray[np.intp]]:
-        """For a field with bumps on a grid of the detector: the columns of each square of 2 x 2 neighbouring bumps, else an empty list."""
+        """For a field with bumps on a grid of the detector: the columns of each square of 2 x 2 neighbouring bumps,
+        else an empty list.
+        """
         if (
             field.width is None
             or field.modulation not in ("place", "pointing")
@@ -193,7 +197,8 @@ class FieldColumns:
         return KERNEL_LIKELY if operator in _OF_PSF else 1.0 if operator == "gain" else self._light
 
     def _forms(self, operator: str, width: float | None, scene: Matrix) -> Matrix:
-        """The change of an image by each form (forms, boxes along y, boxes along x), DN/s; for a gain relative to the image.
+        """The change of an image by each form (forms, boxes along y, boxes along x), DN/s; for a gain relative to the
+        image.
 
         scene: of the image, on the boxes.
         """
@@ -226,7 +231,7 @@ class FieldColumns:
         return np.median(own, axis=0) if own else np.zeros([one.size for one in self.at])
 
     def _in_discs(self, operator: str, width: float | None) -> Matrix:
-        """q . e of every form for every cell (discs, cells, forms)."""
+        """Q . e of every form for every cell (discs, cells, forms)."""
         boxes = (disc.boxes[int(operator == "gain")] for disc in self._discs)
         each = [one.reshape(len(one), -1).astype(np.float64) for one in boxes]
         if operator in _OF_PSF:
@@ -276,8 +281,8 @@ class FieldColumns:
     def shape(self, field: Field, part: Sequence[int], values: Vector, covariance: Matrix) -> FieldShape:
         """The shape of a field with these coefficients (those of `part`): a map of the detector, or a curve.
 
-        A map that changes with time is shown at the end. A curve in time shows the change that all places share; for the PSF, the
-        light that all radii together move.
+        A map that changes with time is shown at the end. A curve in time shows the change that all places share; for
+        the PSF, the light that all radii together move.
         """
         weight, optics = self._modulation(field), field.operator in _OF_PSF
         forms = self._responses(field).discs.shape[2]
@@ -311,7 +316,9 @@ class FieldColumns:
         return {int(p): np.zeros((blocks, forms)) for p in np.unique(self._blocks.pointing)}
 
     def _to_blocks(self, planes: Matrix) -> Matrix:
-        """Means over the blocks (blocks, forms) of planes on the boxes; a block has a whole number of boxes, or the nearest box counts."""
+        """Means over the blocks (blocks, forms) of planes on the boxes; a block has a whole number of boxes, or the
+        nearest box counts.
+        """
         (rows, columns), (down, across) = planes.shape[1:], (one.size for one in self._block_at)
         edge = rows // down
         if edge:
@@ -376,8 +383,9 @@ class FieldColumns:
 class FieldShape:
     """The shape of a field.
 
-    axes: the names of the axes of `at` (points, axes): x and y on the detector, time, or radius in the PSF; empty if the field has no
-    shape. values, sigma: (points,), in `unit`; for the optics a share of the light, along the radius per octave.
+    axes: the names of the axes of `at` (points, axes): x and y on the detector, time, or radius in the PSF; empty if
+    the field has no shape. values, sigma: (points,), in `unit`; for the optics a share of the light, along the radius
+    per octave.
     """
 
     axes: tuple[str, ...]
@@ -398,7 +406,9 @@ def another(family: str) -> str:
 
 
 def with_effect(evidence: Evidence, effect: Effect, discs: Matrix, blocks: Matrix) -> Evidence:
-    """The evidence with one more effect. discs: its columns (discs, cells, columns). blocks: (images, blocks, columns)."""
+    """The evidence with one more effect. discs: its columns (discs, cells, columns). blocks: (images, blocks,
+    columns).
+    """
     own = tuple(range(evidence.size, evidence.size + len(effect.parameters)))
     errors = np.concatenate([evidence.unocculted.errors, np.moveaxis(blocks, -1, 0)])
     return replace(
@@ -414,7 +424,9 @@ def with_effect(evidence: Evidence, effect: Effect, discs: Matrix, blocks: Matri
 
 
 def _core(scene: Matrix) -> Matrix:
-    """The change by a wider core of the PSF: the mean of the four neighbouring boxes minus the box. It moves light by less than a ring."""
+    """The change by a wider core of the PSF: the mean of the four neighbouring boxes minus the box. It moves light by
+    less than a ring.
+    """
     wide = np.pad(scene, 1, mode="edge")
     around = wide[:-2, 1:-1] + wide[2:, 1:-1] + wide[1:-1, :-2] + wide[1:-1, 2:]
     return np.asarray(around / 4 - scene)

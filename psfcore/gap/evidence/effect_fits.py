@@ -1,11 +1,13 @@
-"""The linear fit of one or several effects, as a report states it: parameters, gain and p-value; and the p-value of the gap.
+"""The linear fit of one or several effects, as a report states it: parameters, gain and p-value; and the p-value of the
+gap.
 
 The gain of an effect is the decrease of chi2 when its parameters are fitted together with the PSF. From noise alone, a
 free parameter gains a chi2 variable with one degree of freedom, and the parameters of a random field gain less
 (`linear_model`, Eq. (3)). If an effect searched among many templates, its p-value is multiplied by their number.
 
-The p-value of the gap is the probability of residuals at least as large as these if there is no gap: the smallest p-value of chi2 of
-all cells, of the means of the discs, and of the blocks of the unocculted field, after the fit of the PSF alone, times three.
+The p-value of the gap is the probability of residuals at least as large as these if there is no gap: the smallest
+p-value of chi2 of all cells, of the means of the discs, and of the blocks of the unocculted field, after the fit of the
+PSF alone, times three.
 """
 
 from __future__ import annotations
@@ -21,7 +23,8 @@ from psfcore.arrays import Vector
 from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.linear_model import LinearModel, Step
 
-# Chi2 of the unocculted field may exceed its degrees of freedom by this fraction without a gap: the Sun always changes a little.
+# Chi2 of the unocculted field may exceed its degrees of freedom by this fraction without a gap: the Sun always changes
+# a little.
 UNOCCULTED_WIDTH = 0.03
 
 
@@ -30,7 +33,8 @@ class EffectFit:
     """The linear fit of one effect, or of several effects, together with the PSF.
 
     values: value, error and unit of each parameter; the key is "parameter", or "effect.parameter" if there are several
-    effects. gain: the decrease of chi2. p_value: the p-value of the gain. step: the fit. model: the model that was fitted.
+    effects. gain: the decrease of chi2. p_value: the p-value of the gain. step: the fit. model: the model that was
+    fitted.
     """
 
     names: tuple[str, ...]

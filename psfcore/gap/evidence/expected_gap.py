@@ -1,12 +1,13 @@
-"""The linear model of a fit, and the expected gap: the residuals of a fit to images that are simulated from the fitted model itself.
+"""The linear model of a fit, and the expected gap: the residuals of a fit to images that are simulated from the fitted
+model itself.
 
 The simulation takes the mean scene of each pointing and puts the occulter where it was found. It convolves this scene
 with the fitted PSF and adds photon and read noise. The same fit is then made to the simulated images. In their cells,
 chi2 exceeds its degrees of freedom although the model is right: the position of an occulter is never found exactly, and
 the light near the edge of the field is never restored completely. The expected gap states this excess.
 
-The simulated images are so similar to the real ones that their cells have the same covariance and respond in the same way
-to a change of the PSF. Only their residuals are computed again.
+The simulated images are so similar to the real ones that their cells have the same covariance and respond in the same
+way to a change of the PSF. Only their residuals are computed again.
 """
 
 from __future__ import annotations

@@ -3,12 +3,12 @@
     chi2(theta) = sum over discs of (r - J theta)^T C^-1 (r - J theta) + chi2 of the unocculted blocks  Eq. (1)
     C = noise of the cells + f^2 m m^T                                                                  Eq. (2)
 
-r are the residuals in the cells of a disc, J is their Jacobian, theta are the parameters, and m is the expected light in
-the cells. The floor f is a relative error common to all cells of a disc. It allows for causes that are in no model. While
-an effect is tested, the coordinates of the PSF are refitted. The effect therefore gets no credit for residuals that a
-change of the PSF can absorb. The parameters of an effect have a Gaussian prior. Its width is UNLIKELY times their likely size;
-an implausible offset of 200 DN can then explain nothing. The gain of an effect is the decrease of chi2, including the
-term of the prior.
+r are the residuals in the cells of a disc, J is their Jacobian, theta are the parameters, and m is the expected light
+in the cells. The floor f is a relative error common to all cells of a disc. It allows for causes that are in no model.
+While an effect is tested, the coordinates of the PSF are refitted. The effect therefore gets no credit for residuals
+that a change of the PSF can absorb. The parameters of an effect have a Gaussian prior. Its width is UNLIKELY times
+their likely size; an implausible offset of 200 DN can then explain nothing. The gain of an effect is the decrease of
+chi2, including the term of the prior.
 
 A random field has many parameters, for example the cosines of a flat-field error. Their prior has the width S, their
 likely size. Let N be the normal matrix of these parameters with all other parameters refitted, and l the eigenvalues of
@@ -69,8 +69,8 @@ class Step:
 class LinearModel:
     """Eq. (1) for the evidence of a transit.
 
-    floor: f of Eq. (2). disc_scale, unocculted_scale: chi2 per degree of freedom that the discs and the unocculted blocks
-    have without a gap. scale_error: relative error of disc_scale.
+    floor: f of Eq. (2). disc_scale, unocculted_scale: chi2 per degree of freedom that the discs and the unocculted
+    blocks have without a gap. scale_error: relative error of disc_scale.
     """
 
     evidence: Evidence
@@ -114,7 +114,9 @@ class LinearModel:
         return {}
 
     def fit(self, columns: Sequence[int], equations: tuple[Matrix, Vector] | None = None) -> Step:
-        """Fit the coordinates of the PSF and these columns. equations: a result of `equations` (None: for all images)."""
+        """Fit the coordinates of the PSF and these columns. equations: a result of `equations` (None: for all
+        images).
+        """
         here = [*self.evidence.base, *columns]
         normal, score = self.equations() if equations is None else equations
         normal, score = normal[np.ix_(here, here)] + np.diag(self._prior[here]), score[here]

@@ -1,7 +1,7 @@
 """Measure the noise of the images, to check the noise that the transit states.
 
-Two consecutive images of one pointing show the same scene. Let d be the difference of these images, and d_00 to d_11 its
-values in a square of 2 x 2 px. The mixed second difference
+Two consecutive images of one pointing show the same scene. Let d be the difference of these images, and d_00 to d_11
+its values in a square of 2 x 2 px. The mixed second difference
 
     h = (d_00 - d_01 - d_10 + d_11) / 2          Eq. (1)
 
@@ -48,7 +48,9 @@ class MeasuredNoise:
 
 
 def measured_noise(transit: Transit) -> MeasuredNoise | None:
-    """Measure the noise of a transit. None if too few consecutive images show the same scene, or if no line can be fitted."""
+    """Measure the noise of a transit. None if too few consecutive images show the same scene, or if no line can be
+    fitted.
+    """
     seen = [
         np.array(_blocks(one, other))
         for one, other in itertools.pairwise(transit.frames)
@@ -86,7 +88,9 @@ def _blocks(one: Frame, other: Frame) -> tuple[Vector, Vector]:
 
 
 def _line(level: Vector, variance: Vector) -> tuple[float, float]:
-    """Fit a straight line to the variance as a function of the level; return its slope and intercept. The weight of a block is 1 / (expected variance)^2."""
+    """Fit a straight line to the variance as a function of the level; return its slope and intercept. The weight of a
+    block is 1 / (expected variance)^2.
+    """
     expected = np.full(level.shape, float(np.median(variance)))
     slope = intercept = 0.0
     for _ in range(ROUNDS):

@@ -2,8 +2,8 @@
 
 The evidence consists of small arrays; the later steps of a diagnosis need nothing else. Each column of the Jacobian
 belongs to one parameter: first the coordinates of the PSF, then the parameters of the effects. Near the fit, the images
-are a linear function of these parameters. One pass over the images gives the Jacobian of the cells of the discs (`cells`)
-and of the blocks of the unocculted field (`unocculted_blocks`).
+are a linear function of these parameters. One pass over the images gives the Jacobian of the cells of the discs
+(`cells`) and of the blocks of the unocculted field (`unocculted_blocks`).
 """
 
 from __future__ import annotations
@@ -63,8 +63,8 @@ class ImageInfo:
 class Prior:
     """The prior of the parameter of each column, a Gaussian (columns,). The coordinates of the PSF have no prior.
 
-    likely: the largest plausible size; infinite for the coordinates of the PSF. positive: whether the parameter cannot be
-    negative. field: whether it is a coefficient of a random field.
+    likely: the largest plausible size; infinite for the coordinates of the PSF. positive: whether the parameter cannot
+    be negative. field: whether it is a coefficient of a random field.
     """
 
     likely: Vector
@@ -76,9 +76,10 @@ class Prior:
 class Evidence:
     """All the data that a diagnosis uses.
 
-    effects: the effects that these data can show. columns: the columns of each effect, by its name. base: the columns that
-    every fit contains. discs: the cells of each image that the fit used. image_info: the properties of every image,
-    used or not. untestable: the reasons why effects cannot be tested, by name. box_px: the edge of a box of `DiscCells.boxes`. kernel: the total PSF, summed over boxes. templates: `Effect.distinguished` by effect.
+    effects: the effects that these data can show. columns: the columns of each effect, by its name. base: the columns
+    that every fit contains. discs: the cells of each image that the fit used. image_info: the properties of every
+    image, used or not. untestable: the reasons why effects cannot be tested, by name. box_px: the edge of a box of
+    `DiscCells.boxes`. kernel: the total PSF, summed over boxes. templates: `Effect.distinguished` by effect.
     """
 
     effects: tuple[Effect, ...]
@@ -126,7 +127,8 @@ def gather(
     view: View | None = None,
     progress: Progress = lambda stage, step, steps: None,
 ) -> Evidence:
-    """Compute the evidence of a solution for a library of effects. view: the view of the solution, if it exists already.
+    """Compute the evidence of a solution for a library of effects. view: the view of the solution, if it exists
+    already.
 
     Raises DataError "bad-effects" if an added effect fails.
     """
@@ -210,7 +212,8 @@ def disc_with_jacobian(view: View, n: int, changes: Sequence[Change]) -> DiscCel
     fields = itertools.chain(slopes, (change.change(n, view.expected) for change in changes))
     jacobian = np.zeros((len(view.slopes) + len(changes), flat.shape[0]))
     for first in range(0, len(jacobian), AT_ONCE):
-        # Several fields are processed together, so that the large planes of the cells are read from memory only once for them.
+        # Several fields are processed together, so that the large planes of the cells are read from memory only once
+        # for them.
         some = np.array([np.ravel(one) for one in itertools.islice(fields, AT_ONCE)], dtype=flat.dtype)
         jacobian[first : first + AT_ONCE] = some @ flat.T
     boxes = np.array([summed_over_boxes(planes), summed_over_boxes(planes * view.expected[n])])
@@ -226,12 +229,12 @@ def residuals_at(
     changes: Sequence[Change] = (),
     progress: Progress = lambda stage, step, steps: None,
 ) -> Evidence:
-    """The evidence of another PSF for the same transit: its residuals and its Jacobian of the PSF, with the Jacobian of the effects
-    of `evidence`.
+    """The evidence of another PSF for the same transit: its residuals and its Jacobian of the PSF, with the Jacobian of
+    the effects of `evidence`.
 
     The Jacobian of the effects takes most of the time of `gather`, and hardly differs. view: of the other PSF. columns:
-    the columns after the base that are kept; changes: the changes that belong to them, for discs whose cells have moved.
-    The result has no effects. Discs that `evidence` lacks are left out.
+    the columns after the base that are kept; changes: the changes that belong to them, for discs whose cells have
+    moved. The result has no effects. Discs that `evidence` lacks are left out.
     """
     rows = [*evidence.base, *columns]
     part = set(view.solution.part)

@@ -4,8 +4,8 @@ A template f, displaced by d, changes the mean of disc n by
 
     T_n(d) = sum over pixels of q_n(x) f_n(x - d)          Eq. (1)
 
-where q_n is the sensitivity of the disc (`cells`). This is a correlation, so one correlation gives all displacements. Let r
-be the residuals of the discs that remain after the fit of the PSF. The template at d decreases chi2 by
+where q_n is the sensitivity of the disc (`cells`). This is a correlation, so one correlation gives all displacements.
+Let r be the residuals of the discs that remain after the fit of the PSF. The template at d decreases chi2 by
 
     gain(d) = (sum r T)^2 / sum T^2                        Eq. (2)
 
@@ -17,11 +17,11 @@ the mean of disc n by
 
 One correlation for each disc therefore serves any number of kernels K.
 
-Ghosts (displaced copies of the image) and changes of the PSF core also change the distribution of light within the discs: a
-wider core hardly changes the mean of a disc, but it changes the outermost cells. For them, r and T also contain the cells, by
-Eqs. (1) and (3) in a small patch around each disc (`NearDisc`). The mean brightness of the disc is removed from the responses of
-its cells, because it is known from the whole field. Light that scatters into the disc from outside the patch is nearly
-uniform over the disc, so it is neglected.
+Ghosts (displaced copies of the image) and changes of the PSF core also change the distribution of light within the
+discs: a wider core hardly changes the mean of a disc, but it changes the outermost cells. For them, r and T also
+contain the cells, by Eqs. (1) and (3) in a small patch around each disc (`NearDisc`). The mean brightness of the disc
+is removed from the responses of its cells, because it is known from the whole field. Light that scatters into the disc
+from outside the patch is nearly uniform over the disc, so it is neglected.
 """
 
 from __future__ import annotations
@@ -49,7 +49,8 @@ STEP_PX = 8
 FINE_PX = 2
 COARSE_BLUR_PX = 8.0
 BLURS_PX = (2.0, 4.0, 8.0, 16.0)
-NEAREST_RADII = 1.8  # smallest displacement of a copy, in radii of the disc: a closer copy looks like the disc's surroundings
+# smallest displacement of a copy, in radii of the disc: a closer copy looks like the disc's surroundings
+NEAREST_RADII = 1.8
 KERNEL_REACH_PX = 255  # the orders of the mesh contain little light beyond this distance
 MARGIN_PX = 28  # distance from the edge of the disc to the edge of its patch
 NEAR_REACH_PX = 64  # largest displacement of light within a patch, along each axis
@@ -95,13 +96,15 @@ class PlaceSearch:
     def kernels(self, kernels: Sequence[Matrix]) -> Vector:
         """The gain, Eq. (2), of each change of the PSF: (kernels,).
 
-        kernels: changes of the PSF [y, x], with the centre at n // 2. The search uses the means of the discs and, for light
-        that moves near a disc, also its cells, Eq. (3).
+        kernels: changes of the PSF [y, x], with the centre at n // 2. The search uses the means of the discs and, for
+        light that moves near a disc, also its cells, Eq. (3).
         """
         return self._gain(self._of_discs(self._to_displacements, kernels), self._of_cells(kernels))
 
     def wide_kernels(self, kernels: Sequence[Matrix]) -> Vector:
-        """As `kernels`, for smooth changes of the PSF that may reach across the field. It uses only the means of the discs, not their cells, and coarse pixels."""
+        """As `kernels`, for smooth changes of the PSF that may reach across the field. It uses only the means of the
+        discs, not their cells, and coarse pixels.
+        """
         return self._gain(self._of_discs(self._to_far, [coarse_kernel(one, STEP_PX) for one in kernels]))
 
     def _of_discs(self, to_displacements: NDArray[np.floating], kernels: Sequence[Matrix]) -> Matrix:
@@ -116,11 +119,11 @@ class PlaceSearch:
 
     @cached_property
     def copy(self) -> tuple[tuple[float, int, int], float]:
-        """The blur (px) and the displacement (whole pixels x, y) of the copy of the image that explains most of the residuals; and
-        the number of copies that the data distinguish.
+        """The blur (px) and the displacement (whole pixels x, y) of the copy of the image that explains most of the
+        residuals; and the number of copies that the data distinguish.
 
-        A copy is displaced by at least NEAREST_RADII times the radius of the disc. The search uses a coarse grid with one blur,
-        then a fine grid around the best displacement with several blurs.
+        A copy is displaced by at least NEAREST_RADII times the radius of the disc. The search uses a coarse grid with
+        one blur, then a fine grid around the best displacement with several blurs.
         """
         copies = (gaussian_filter(self._expected[n], COARSE_BLUR_PX) for n in self._images)
         both = zip(self._planes, copies, strict=True)
@@ -158,8 +161,9 @@ class PlaceSearch:
     def _gain(self, means: Matrix, cells: Matrix | None = None, *, least: float = 0.0) -> Vector:
         """Eq. (2) for several templates (templates,).
 
-        means: T of the means of the discs (discs, templates). cells: T of the cells (cells, templates), in units of the noise;
-        None: use the means alone. least: a template gains 0 if its sum T^2 is below this fraction of the largest sum T^2.
+        means: T of the means of the discs (discs, templates). cells: T of the cells (cells, templates), in units of the
+        noise; None: use the means alone. least: a template gains 0 if its sum T^2 is below this fraction of the largest
+        sum T^2.
         """
         responses, left = means / self._sigma[:, None], self._of_means
         if cells is not None:
@@ -173,8 +177,8 @@ class PlaceSearch:
 def distinguished(gains: Vector) -> float:
     """The effective number of templates that the data distinguish, from the gain of each of them (templates,).
 
-    A search uses the template with the largest gain. The evidence is the mean over all templates, of which each is a priori
-    equally probable. The evidence of the best one must therefore be divided by
+    A search uses the template with the largest gain. The evidence is the mean over all templates, of which each is a
+    priori equally probable. The evidence of the best one must therefore be divided by
 
         M / sum over templates of exp((gain - largest gain) / 2)                        Eq. (4)
 
@@ -205,9 +209,9 @@ class _Unabsorbed:
 class NearDisc:
     """The cells of one disc, in a patch around it.
 
-    top, left: the first pixel of the patch. planes: the sensitivities of the cells (cells, y, x). residual: their residuals
-    (cells,). to_displacements: C of Eq. (3) (cells, displacements y, displacements x). All are in units of the noise of the cells,
-    without the mean of the disc.
+    top, left: the first pixel of the patch. planes: the sensitivities of the cells (cells, y, x). residual: their
+    residuals (cells,). to_displacements: C of Eq. (3) (cells, displacements y, displacements x). All are in units of
+    the noise of the cells, without the mean of the disc.
     """
 
     top: int
@@ -271,9 +275,11 @@ def near_discs(view: View, images: Sequence[int]) -> list[NearDisc]:
 def _sums(
     planes: NDArray[np.floating], image: NDArray[np.floating], reach: int, top: int = 0, left: int = 0
 ) -> NDArray[np.floating]:
-    """Eq. (1) for displacements up to `reach` along each axis: (planes, 2 reach + 1, 2 reach + 1), with d = 0 in the middle.
+    """Eq. (1) for displacements up to `reach` along each axis: (planes, 2 reach + 1, 2 reach + 1), with d = 0 in the
+    middle.
 
-    planes: q (planes, y, x); their first pixel is the pixel [top, left] of the image. The image is 0 outside its pixels.
+    planes: q (planes, y, x); their first pixel is the pixel [top, left] of the image. The image is 0 outside its
+    pixels.
     """
     ny, nx = planes.shape[1:]
     return correlations(
@@ -282,7 +288,9 @@ def _sums(
 
 
 def _at_displacements(plane: Matrix, image: Matrix) -> Matrix:
-    """Eq. (1) for one plane, at all displacements at which at least two of its rows or columns overlap with the image."""
+    """Eq. (1) for one plane, at all displacements at which at least two of its rows or columns overlap with the
+    image.
+    """
     return np.asarray(_sums(plane[None], image, max(plane.shape) - 2)[0])
 
 

@@ -1,8 +1,8 @@
 """The tree of causes: stage, family, form.
 
-A family is an operator times a modulation: for example, light that is added (`light`) and changes with time (`time`). Its
-forms are the effects of the library that belong to it, and its free fields: sums of bumps of one width with random coefficients
-(`columns`). A field stands for every cause of its family that is smooth on the scale of its bumps.
+A family is an operator times a modulation: for example, light that is added (`light`) and changes with time (`time`).
+Its forms are the effects of the library that belong to it, and its free fields: sums of bumps of one width with random
+coefficients (`columns`). A field stands for every cause of its family that is smooth on the scale of its bumps.
 
 | stage | what it does |
 |---|---|
@@ -26,7 +26,9 @@ SPOT = 0.1  # width of the bumps of a change at one place
 
 @dataclass(frozen=True)
 class Family:
-    """A family of causes. words: its name in text. settled_by: the observation that shows such a cause. axes: of the report, along which it varies."""
+    """A family of causes. words: its name in text. settled_by: the observation that shows such a cause. axes: of the
+    report, along which it varies.
+    """
 
     name: str
     stage: Stage
@@ -46,35 +48,137 @@ FAMILIES: dict[str, Family] = {
     for one in (
         Family("light_place", "detector", "light added at places of the detector", _DARK, _PLACE),
         Family("light_time", "detector", "added light that changes with time", _DARK, ("time",)),
-        Family("light_place_time", "detector", "light added at places of the detector that changes with time", _DARK, ("time", *_PLACE)),
-        Family("offset_place", "detector", "an offset of each readout", f"a dark exposure, or {_LADDER}", ("exposure", "intensity")),
-        Family("offset_time", "detector", "an offset of each readout that changes with time", "dark exposures during the transit", ("time", "exposure")),
-        Family("offset_place_time", "detector", "an offset of each readout that changes with place and time", "dark exposures during the transit", ("time", "exposure", *_PLACE)),
-        Family("gain_place", "detector", "a gain error that changes with the place on the detector", _MOVED, _PLACE),
+        Family(
+            "light_place_time",
+            "detector",
+            "light added at places of the detector that changes with time",
+            _DARK,
+            ("time", *_PLACE),
+        ),
+        Family(
+            "offset_place",
+            "detector",
+            "an offset of each readout",
+            f"a dark exposure, or {_LADDER}",
+            ("exposure", "intensity"),
+        ),
+        Family(
+            "offset_time",
+            "detector",
+            "an offset of each readout that changes with time",
+            "dark exposures during the transit",
+            ("time", "exposure"),
+        ),
+        Family(
+            "offset_place_time",
+            "detector",
+            "an offset of each readout that changes with place and time",
+            "dark exposures during the transit",
+            ("time", "exposure", *_PLACE),
+        ),
+        Family(
+            "gain_place",
+            "detector",
+            "a gain error that changes with the place on the detector",
+            _MOVED,
+            _PLACE,
+        ),
         Family("gain_time", "detector", "a gain that changes with time", _TWICE, ("time",)),
-        Family("gain_place_time", "detector", "a gain that changes with place and time", _TWICE, ("time", *_PLACE)),
-        Family("gain_kind", "detector", "a gain that differs between gain modes or exposure times", "images of the same scene in all gain modes and exposure times", ("gain_mode", "exposure")),
-        Family("response", "detector", "a response of the detector that depends on the signal", _LADDER, ("intensity",)),
-        Family("memory", "detector", "charge that stays or moves in the detector", "a dark exposure after a bright one", ("time", "pointing", "detector_y", "intensity")),
-        Family("psf", "optics", "a change of the PSF", "a transit along a second track that crosses the first", ("scattering_distance", *_DISC, *_PLACE)),
+        Family(
+            "gain_place_time",
+            "detector",
+            "a gain that changes with place and time",
+            _TWICE,
+            ("time", *_PLACE),
+        ),
+        Family(
+            "gain_kind",
+            "detector",
+            "a gain that differs between gain modes or exposure times",
+            "images of the same scene in all gain modes and exposure times",
+            ("gain_mode", "exposure"),
+        ),
+        Family(
+            "response",
+            "detector",
+            "a response of the detector that depends on the signal",
+            _LADDER,
+            ("intensity",),
+        ),
+        Family(
+            "memory",
+            "detector",
+            "charge that stays or moves in the detector",
+            "a dark exposure after a bright one",
+            ("time", "pointing", "detector_y", "intensity"),
+        ),
+        Family(
+            "psf",
+            "optics",
+            "a change of the PSF",
+            "a transit along a second track that crosses the first",
+            ("scattering_distance", *_DISC, *_PLACE),
+        ),
         Family("psf_place", "optics", "a PSF that changes over the field", _TRACK, _PLACE),
         Family("psf_time", "optics", "a PSF that changes with time", _TWICE, ("time",)),
-        Family("psf_place_time", "optics", "a PSF that changes with place and time", _TWICE, ("time", *_PLACE)),
-        Family("core", "optics", "a change of the core of the PSF", "an image of a sharp limb or of a point source", _DISC),
-        Family("ghost", "optics", "a displaced copy of the image", "images of a bright source at several positions in the field", (*_PLACE, "intensity")),
-        Family("edge", "scene", "light at the edge of the occulter", "shorter exposures, or an occulter without an atmosphere", _DISC),
-        Family("edge_time", "scene", "light in front of the occulter that changes with time", "the occulter off the Sun", ("time", *_DISC)),
-        Family("outside", "scene", "light from outside the field", "full-Sun images taken at the same time", ("scattering_distance", "pointing", "intensity")),
-        Family("light_pointing", "scene", "light added in one pointing", "an exposure with the door closed at each pointing", ("pointing", *_PLACE)),
+        Family(
+            "psf_place_time", "optics", "a PSF that changes with place and time", _TWICE, ("time", *_PLACE)
+        ),
+        Family(
+            "core",
+            "optics",
+            "a change of the core of the PSF",
+            "an image of a sharp limb or of a point source",
+            _DISC,
+        ),
+        Family(
+            "ghost",
+            "optics",
+            "a displaced copy of the image",
+            "images of a bright source at several positions in the field",
+            (*_PLACE, "intensity"),
+        ),
+        Family(
+            "edge",
+            "scene",
+            "light at the edge of the occulter",
+            "shorter exposures, or an occulter without an atmosphere",
+            _DISC,
+        ),
+        Family(
+            "edge_time",
+            "scene",
+            "light in front of the occulter that changes with time",
+            "the occulter off the Sun",
+            ("time", *_DISC),
+        ),
+        Family(
+            "outside",
+            "scene",
+            "light from outside the field",
+            "full-Sun images taken at the same time",
+            ("scattering_distance", "pointing", "intensity"),
+        ),
+        Family(
+            "light_pointing",
+            "scene",
+            "light added in one pointing",
+            "an exposure with the door closed at each pointing",
+            ("pointing", *_PLACE),
+        ),
         *(Family(f"other_{stage}", stage, f"another change of the {stage}", "", ()) for stage in STAGES),
-        Family("sun", "scene", "a changing Sun", "images that are closer together in time", ("time", "pointing")),
+        Family(
+            "sun", "scene", "a changing Sun", "images that are closer together in time", ("time", "pointing")
+        ),
     )
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True)
 class Field:
-    """A free field: the operator and the modulation of `columns`. width: of its bumps. pointing: of a change in one pointing."""
+    """A free field: the operator and the modulation of `columns`. width: of its bumps. pointing: of a change in one
+    pointing.
+    """
 
     family: str
     operator: str
@@ -101,8 +205,9 @@ class Field:
 
 
 def fields_of(pointings: Sequence[int], *, exposures: bool, kinds: bool) -> list[Field]:
-    """The fields that images can show. pointings: the numbers of the pointings. exposures: whether exposure times differ. kinds:
-    whether exposure times or gain modes differ."""
+    """The fields that images can show. pointings: the numbers of the pointings. exposures: whether exposure times
+    differ. kinds: whether exposure times or gain modes differ.
+    """
     found = []
     for operator in ("light", "gain", *(["offset"] if exposures else [])):
         widths = {

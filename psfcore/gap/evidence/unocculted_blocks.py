@@ -5,8 +5,9 @@ the occulter hides is added to each image. Then the level of block b in image n 
 
     U_nb = mu_b (1 + g_n) + sum over parameters of theta e_nb + noise            Eq. (1)
 
-The scene mu_b is a free parameter of every block. The relative brightness g_n is a free parameter of every image, because
-the Sun and the shutter vary by about one percent. e_nb is the change of the block by one unit of the parameter theta.
+The scene mu_b is a free parameter of every block. The relative brightness g_n is a free parameter of every image,
+because the Sun and the shutter vary by about one percent. e_nb is the change of the block by one unit of the parameter
+theta.
 
 g_n has a Gaussian prior. The width of the prior is the spread of g_n among images of the same pointing, gain mode and
 exposure; a difference between gain modes can then be separated from g_n.
@@ -62,7 +63,8 @@ class UnoccultedBlocks:
     @cached_property
     def gain_width(self) -> float:
         """The width of the prior of g_n: `given_gain_width`; if this is None, the rms spread of g_n in images of the
-        same kind."""
+        same kind.
+        """
         if self.given_gain_width is not None:
             return self.given_gain_width
         every, spread = self.equations((), width=WIDEST_GAIN).gains, list[float]()
@@ -80,8 +82,8 @@ class UnoccultedBlocks:
     def equations(
         self, columns: Sequence[int], images: Sequence[int] | None = None, *, width: float | None = None
     ) -> UnoccultedEquations:
-        """The normal equations of these columns. images: the images to use; None: all. width: the width of the prior of g_n;
-        None: `gain_width`.
+        """The normal equations of these columns. images: the images to use; None: all. width: the width of the prior of
+        g_n; None: `gain_width`.
 
         Scene and brightness are free parameters.
         """
@@ -122,10 +124,12 @@ class UnoccultedBlocks:
         )
 
     def held_out(self, columns: Sequence[int], n: int, fitted: Sequence[int]) -> tuple[Vector, Matrix]:
-        """The held-out image n minus the scene of the fitted images, and the Jacobian of this difference, in units of the noise.
+        """The held-out image n minus the scene of the fitted images, and the Jacobian of this difference, in units of
+        the noise.
 
-        fitted: the images that give the scene. The two results have the shapes (values,) and (columns, values). They contain
-        the values of the blocks, followed by the brightness in units of `gain_width`; nothing if the scene is not known.
+        fitted: the images that give the scene. The two results have the shapes (values,) and (columns, values). They
+        contain the values of the blocks, followed by the brightness in units of `gain_width`; nothing if the scene is
+        not known.
         """
         errors = self.errors[list(columns)]
         here = [k for k in fitted if self.pointing[k] == self.pointing[n] and self.part[k]]
@@ -150,9 +154,10 @@ class UnoccultedBlocks:
 class UnoccultedEquations:
     """Normal equations of some columns, with brightness and scene eliminated.
 
-    normal: the normal matrix. score: the right-hand side. chi2: after the fit of scene and brightness alone, without the columns.
-    freedom: degrees of freedom of this chi2, if the brightness of every image is free. independent: the same with the prior of the brightness, which leaves
-    it less free. gains: the fitted g_n of each image, without the columns.
+    normal: the normal matrix. score: the right-hand side. chi2: after the fit of scene and brightness alone, without
+    the columns. freedom: degrees of freedom of this chi2, if the brightness of every image is free. independent: the
+    same with the prior of the brightness, which leaves it less free. gains: the fitted g_n of each image, without the
+    columns.
     """
 
     normal: Matrix
@@ -169,7 +174,9 @@ def block_px(shape: tuple[int, int]) -> int:
 
 
 def block_means(plane: NDArray[np.floating], edge: int) -> Matrix:
-    """The means of a plane [y, x] over squares of `edge` px. Incomplete squares in the last rows and columns are dropped."""
+    """The means of a plane [y, x] over squares of `edge` px. Incomplete squares in the last rows and columns are
+    dropped.
+    """
     return np.asarray(squares(plane, edge).mean(axis=(1, 3), dtype=np.float64))
 
 
@@ -180,7 +187,8 @@ def blocks(plane: NDArray[np.floating]) -> Vector:
 
 def unocculted_blocks(view: View, columns: int, progress: Progress) -> UnoccultedBlocks:
     """The blocks of all images. columns: the number of columns of `errors`. `errors` is zero; the caller fills it
-    in."""
+    in.
+    """
     transit, edge = view.solution.transit, block_px(view.solution.transit.shape)
     levels, variance, free, means = [], [], [], []
     for n, (frame, seen) in enumerate(zip(transit.frames, view.solution.sky.found, strict=True)):

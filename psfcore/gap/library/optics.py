@@ -62,7 +62,8 @@ def _searching(
     described: Callable[[Any], str] = lambda template: "",
 ) -> Effect:
     """An effect that uses the best of several templates. search: runs once for each view. changes(view, template): the changes
-    by a template. described(template): the text that follows the cause if the template is held."""
+    by a template. described(template): the text that follows the cause if the template is held.
+    """
 
     def best(view: View) -> _Best:
         return view.once(plain.name, lambda: search(view))

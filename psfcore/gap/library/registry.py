@@ -42,7 +42,8 @@ class Added:
 
 def added_effects(sources: Sequence[str]) -> tuple[Added, ...]:
     """The effects that files (their paths end in .py) and modules add to the library. Raises DataError
-    "bad-effects"."""
+    "bad-effects".
+    """
     added = tuple(_added(source) for source in sources)
     names = {effect.name for effect in LIBRARY}
     for source, effect in ((one.source, effect) for one in added for effect in one.effects):

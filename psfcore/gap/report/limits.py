@@ -1,4 +1,6 @@
-"""What the data of a transit could have shown, and which effects they cannot tell apart; and the page and text of a plan."""
+"""What the data of a transit could have shown, and which effects they cannot tell apart; and the page and text of a
+plan.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,8 @@ Row = list[str]
 NOT_FOUND = "not found"
 SEARCHED = "*"
 OF_SEARCH = (
-    f"{SEARCHED} The effect searches for its position or form; the strength holds for the position or form that the search "
+    f"{SEARCHED} The effect searches for its position or form; the strength holds for the position or form that the "
+    "search "
     "found in the simulated images."
 )
 
@@ -51,7 +54,9 @@ def pair_rows(limits: Limits) -> list[Row]:
 
 
 def distance_table(limits: Limits) -> tuple[Row, list[Row]]:
-    """The table of the distances between the effects, in pairs. The rows number the effects; the columns have the same numbers."""
+    """The table of the distances between the effects, in pairs. The rows number the effects; the columns have the same
+    numbers.
+    """
     names, rows = list(limits.effects), []
     for k, name in enumerate(names, 1):
         cells = [

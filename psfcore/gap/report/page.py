@@ -1,7 +1,7 @@
 """The page of a gap diagnosis: first the summary sentence, then numbers and figures, the most important ones first.
 
-The template `page.html` holds the texts. The functions of this module make the rows of its tables. The named effects are
-those that the verdict names as the cause of the gap ("answer" in the report).
+The template `page.html` holds the texts. The functions of this module make the rows of its tables. The named effects
+are those that the verdict names as the cause of the gap ("answer" in the report).
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ MOST_HYPOTHESES = 8
 def gap_page(found: Diagnosis, report: Report) -> Page:
     """The page of a diagnosis. report: its report (schema gap/3).
 
-    The optional entry "provenance" of the report states the software, the libraries, the seed and the PSF at which the fit
-    started.
+    The optional entry "provenance" of the report states the software, the libraries, the seed and the PSF at which the
+    fit started.
     """
     version = report.get("provenance", {}).get("software_version", "")
     optical = [
@@ -142,7 +142,8 @@ def psf_table(found: Diagnosis, report: Report) -> tuple[Row, list[Row]]:
 
 def _compared(values: list[tuple[float, float]]) -> Row:
     """The values with their errors. For two values, also the second minus the first, in units of the error of the
-    first."""
+    first.
+    """
     cells = [with_error(*one) for one in values]
     if len(values) == 2:
         (first, sigma), (second, _) = values

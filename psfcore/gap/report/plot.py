@@ -1,8 +1,8 @@
 """The figures of a gap diagnosis: each as a PNG for a page about ten inches wide, and all of them in one picture.
 
 Residuals are simulated minus observed, in percent of the observed mean of a disc. The named effects are those that the
-verdict names as the cause of the gap ("answer" in the report). Full symbols show the fitted model without any cause, open
-symbols the model with the told causes. Each pointing has a colour and a symbol.
+verdict names as the cause of the gap ("answer" in the report). Full symbols show the fitted model without any cause,
+open symbols the model with the told causes. Each pointing has a colour and a symbol.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ _ANSWER, _OTHER = "#0072B2", "#9a9a9a"
 # Smallest and largest closure that the chart shows; longer bars are cut.
 _NO_CLOSURE, _MOST_CLOSURE = -0.35, 1.3
 _TITLES = ("Fitted model", "With the told causes")
-# The cells of a disc: inner and outer radius of the ring (in radii of the dark disc), number of the sector, sectors in the ring.
+# The cells of a disc: inner and outer radius of the ring (in radii of the dark disc), number of the sector, sectors in
+# the ring.
 _CELLS = [(low, high, k, sectors) for low, high, sectors in RINGS for k in range(sectors)]
 
 
@@ -112,16 +113,16 @@ def map_png(report: Report) -> bytes:
 def draw_map(figure: Any, report: Report) -> None:
     """Draw the residual of each image at the position of its disc on the detector.
 
-    First chart: the fitted model without effects. Second chart, if there are residuals with the named effects: the model with
-    these effects, on the same colour scale.
+    First chart: the fitted model without effects. Second chart, if there are residuals with the named effects: the
+    model with these effects, on the same colour scale.
     """
     charts, rows = _panels(figure, has_after(report)), report["images"]
     x, y, before, noise = (_column(rows, name) for name in ("x_px", "y_px", "residual_pct", "noise_pct"))
     top, drawn = _scale(before, noise), None
     ny, nx = report["shape"]
     for axes, values in zip(charts, (before, _column(rows, "residual_after_pct")), strict=False):
-        for fov, (here, _, symbol) in _looks(rows).items():
-            here = here & np.isfinite(values)
+        for fov, (of_fov, _, symbol) in _looks(rows).items():
+            here = of_fov & np.isfinite(values)
             drawn = axes.scatter(
                 x[here],
                 y[here],
@@ -189,7 +190,9 @@ def cells_png(found: Diagnosis) -> bytes:
 
 
 def draw_cells(figure: Any, found: Diagnosis) -> None:
-    """Draw each cell as a sector of a ring. The second chart, if effects are named, shows the model with the named effects."""
+    """Draw each cell as a sector of a ring. The second chart, if effects are named, shows the model with the named
+    effects.
+    """
     charts = _panels(figure, bool(found.corrected))
     evidences = [found.evidence, *([found.corrected.model.evidence] if found.corrected else [])]
     maps = [cell_means(evidence.discs) for evidence in evidences]
@@ -270,7 +273,9 @@ def effects_png(report: Report) -> bytes:
 
 
 def slices_png(found: Diagnosis) -> bytes:
-    """Light along x through the occulter with the largest residual: observed, and simulated without and with the named effects."""
+    """Light along x through the occulter with the largest residual: observed, and simulated without and with the named
+    effects.
+    """
     return _png(4.95 * (1 + bool(found.corrected)) + 0.1, 3.7, _draw_slices, found)
 
 
@@ -363,7 +368,9 @@ def _looks(rows: Sequence[dict[str, Any]]) -> dict[int, tuple[Flags, str, str]]:
 
 
 def draw_where(axes: Any, report: Report) -> None:
-    """Draw one horizontal bar for each axis, with its p-value. The axes are in the order of the report; the first is at the top."""
+    """Draw one horizontal bar for each axis, with its p-value. The axes are in the order of the report; the first is at
+    the top.
+    """
     rows = report["where"]
     at, shares = np.arange(len(rows))[::-1], np.array([100 * row["share"] for row in rows])
     colours = [_ANSWER if n == 0 and report["verdict"] != "none" else _OTHER for n in range(len(rows))]
@@ -378,7 +385,9 @@ def draw_where(axes: Any, report: Report) -> None:
 
 
 def draw_effects(axes: Any, report: Report) -> None:
-    """Draw the closure by each effect, with its 90 % interval and its probability. The named or tied effects are blue."""
+    """Draw the closure by each effect, with its 90 % interval and its probability. The named or tied effects are
+    blue.
+    """
     rows = fits_of(report)[:MOST_EFFECTS]
     at, chosen = np.arange(len(rows))[::-1], [_chosen(row, report) for row in rows]
     mark = {"attributed": "  (named)", "tie": "  (tied)"}.get(report["verdict"], "")
@@ -398,7 +407,8 @@ def draw_effects(axes: Any, report: Report) -> None:
 
 def _chosen(row: Report, report: Report) -> bool:
     """Whether a row of the report is the fit of the named effects. For a tie: whether it is the fit of a tied
-    hypothesis."""
+    hypothesis.
+    """
     names = set(row["name"].split(" + "))
     return names == set(report["answer"]) or (report["verdict"] == "tie" and names <= set(report["answer"]))
 

@@ -1,4 +1,5 @@
-"""The gap report as JSON (schema gap/3), and its three lines: where the gap lies, which cause explains it, and how far it shrinks.
+"""The gap report as JSON (schema gap/3), and its three lines: where the gap lies, which cause explains it, and how far
+it shrinks.
 
 The told causes are the most probable alternatives of each cause of the answer (`verdict.answer`), without the Sun.
 """
@@ -196,7 +197,9 @@ def _fit(found: Diagnosis, fit: EffectFit, shrinking: Shrinking | None) -> dict[
 
 
 def _images(found: Diagnosis) -> list[dict[str, Any]]:
-    """The disc of every image: its position, its brightness, and its held-out residuals without and with the told causes."""
+    """The disc of every image: its position, its brightness, and its held-out residuals without and with the told
+    causes.
+    """
     before, after = _residuals(found.residual), _residuals(found.residual_after)
     out = []
     for disc in found.evidence.discs:
@@ -231,7 +234,9 @@ def _residuals(held_out: HeldOut | None) -> dict[int, tuple[float, float]]:
 
 
 def would_separate(found: Diagnosis) -> str:
-    """The observations that would separate the alternatives of the causes, as text; empty if every cause has one alternative."""
+    """The observations that would separate the alternatives of the causes, as text; empty if every cause has one
+    alternative.
+    """
     settled_by = {effect.name: effect.settled_by for effect in found.evidence.effects}
     observations = [
         settled_by[one.effect] if one.effect is not None else one.family.settled_by
@@ -256,11 +261,13 @@ def _nowhere(found: Diagnosis) -> str:
     images = len(found.evidence.discs)
     if found.residual is None:
         return (
-            f"no gap is visible in these {images} images, but a gap may exist: with fewer than {LEAST_IMAGES} images, no image can "
+            f"no gap is visible in these {images} images, but a gap may exist: with fewer than {LEAST_IMAGES} images, "
+            "no image can "
             "be held out."
         )
     return (
-        f"no gap is detected: on held-out images the discs differ from the model by {_gap_words(found)} beyond the noise of "
+        f"no gap is detected: on held-out images the discs differ from the model by {_gap_words(found)} beyond the "
+        "noise of "
         f"{found.noise_pct:.1f} %."
     )
 
@@ -291,7 +298,10 @@ def _gap_words(found: Diagnosis) -> str:
 def _where(found: Diagnosis) -> str:
     if shown_by_blocks(found):
         _, blocks = found.answer.closed.chi2_left([])
-        lead = f"a gap in the unocculted field, whose images differ by {np.sqrt(blocks):.1f} times their noise; the discs do not show it"
+        lead = (
+            f"a gap in the unocculted field, whose images differ by {np.sqrt(blocks):.1f} times their noise; the "
+            "discs do not show it"
+        )
     else:
         lead = f"a gap of {_gap_words(found)} in the discs"
     axes = [axis for axis in found.where if axis.p_value <= SIGNIFICANT and axis.share >= LEAST_SHARE_OF_AXIS]
@@ -379,7 +389,10 @@ def _how_far(found: Diagnosis) -> str:
     if shown_by_blocks(found):
         return f"{out}."
     verb = "falls" if found.after.value < found.rms.value else "changes"
-    return f"{out}; the gap in the discs {verb} from {found.rms.value:.1f} % to {found.after.value:.1f} %, with a noise of {found.noise_pct:.1f} %."
+    return (
+        f"{out}; the gap in the discs {verb} from {found.rms.value:.1f} % to {found.after.value:.1f} %, with a "
+        f"noise of {found.noise_pct:.1f} %."
+    )
 
 
 def _closure_words(closure: Interval) -> str:

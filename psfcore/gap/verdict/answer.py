@@ -1,27 +1,29 @@
 """The answer: which cause explains the gap, at the level at which the data are sure.
 
-The hypotheses are no cause, one form (`closed_form.Form`), and two forms of different families; also two forms and the Sun, because
-the Sun always may change. Their prior: NONE, ONE and TWO; families are equally likely; within a family, half of the
-weight belongs to the effects of the library and half to other forms. A family without fields has other forms too, which no
-hypothesis describes.
+The hypotheses are no cause, one form (`closed_form.Form`), and two forms of different families; also two forms and the
+Sun, because the Sun always may change. Their prior: NONE, ONE and TWO; families are equally likely; within a family,
+half of the weight belongs to the effects of the library and half to other forms. A family without fields has other
+forms too, which no hypothesis describes.
 
-**Two priors of the Sun.** In the first, the blocks change independently. In the second, the Sun also changes the brightness of large
-areas, like a gain that changes with place and time, and the edges of the discs, because it changes the places at which the occulters
-are found. The probability of a hypothesis is the mean over both; where
-they disagree, the answer is the tie "the Sun, or an instrument that changes with time".
+**Two priors of the Sun.** In the first, the blocks change independently. In the second, the Sun also changes the
+brightness of large areas, like a gain that changes with place and time, and the edges of the discs, because it changes
+the places at which the occulters are found. The probability of a hypothesis is the mean over both; where they disagree,
+the answer is the tie "the Sun, or an instrument that changes with time".
 
-**Detection.** A gap is detected if something is more than FLOOR times as probable as no cause. Otherwise there is no cause in the answer.
+**Detection.** A gap is detected if something is more than FLOOR times as probable as no cause. Otherwise there is no
+cause in the answer.
 
-**Causes.** The first cause is the smallest group of labels of which at least one acts with the probability `level`, given that something
-acts (a minimal hitting set, as in consistency-based diagnosis: de Kleer and Williams 1987, Artificial Intelligence 32, 97). A label is
-an effect of the library, or "another form" of a family. An effect of the library takes the probability of the other forms of its family
-if it is more probable than they are; they take its probability if they are more than BEATEN times as probable. A further cause is
-told if hypotheses with so many causes together have the probability FURTHER.
+**Causes.** The first cause is the smallest group of labels of which at least one acts with the probability `level`,
+given that something acts (a minimal hitting set, as in consistency-based diagnosis: de Kleer and Williams 1987,
+Artificial Intelligence 32, 97). A label is an effect of the library, or "another form" of a family. An effect of the
+library takes the probability of the other forms of its family if it is more probable than they are; they take its
+probability if they are more than BEATEN times as probable. A further cause is told if hypotheses with so many causes
+together have the probability FURTHER.
 
 | the causes | verdict | answer |
 |---|---|---|
 | none, and at least LEAST_IMAGES images | none | - |
-| each is one label, at least one an effect | attributed | the effects; also "unknown", if another form acts beside them |
+| each is one label, at least one an effect | attributed | the effects; and "unknown" for another form beside them |
 | each is one label, none an effect | unknown | - |
 | the alternatives of each are effects | tie | all of them |
 | anything else | inconclusive | the most probable effects |
@@ -74,7 +76,8 @@ LEADING, OF_LIBRARY = (
 )  # forms that are weighed in pairs: the most probable ones, and those of the library
 FIRST_OF_PAIR = 5  # one form of a pair is among this number of most probable forms
 TRIPLES = 4  # the best pairs, beside which the Sun is weighed
-# Families that the Sun causes beside the changes of the blocks: it changes large areas, and the place where an occulter is found.
+# Families that the Sun causes beside the changes of the blocks: it changes large areas, and the place where an occulter
+# is found.
 COHERENT = ("gain_time", "gain_place_time", "core", "edge", "edge_time")
 UNKNOWN = "unknown"
 
@@ -194,8 +197,8 @@ def answer_of(model: LinearModel, level: float) -> Answer:
 class _Weighed:
     """ln E of every hypothesis of a closed form.
 
-    alone: of each form. variants: the best variant of each form. together: of two or three forms, in their best variants.
-    The forms of every key have the order of `in_order`, so a part of a key is a key as well.
+    alone: of each form. variants: the best variant of each form. together: of two or three forms, in their best
+    variants. The forms of every key have the order of `in_order`, so a part of a key is a key as well.
     """
 
     def __init__(self, closed: ClosedForm) -> None:

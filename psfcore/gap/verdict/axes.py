@@ -5,10 +5,10 @@ confounded: a transit has few pointings and one track, so position, time and bri
 explain a decrease of chi2. The share of an axis is its contribution to this decrease, averaged over all orders in which
 the axes can be added (Shapley value).
 
-The p-value of an axis comes from random sign flips: each flip reverses the sign of the residuals of random images. A flip counts
-if this axis alone then decreases chi2 at least as much as for the true residuals. The p-value is the fraction of flips that
-count, times the number of axes. If the brightness of the unocculted field gives a smaller p-value, that p-value is
-used.
+The p-value of an axis comes from random sign flips: each flip reverses the sign of the residuals of random images. A
+flip counts if this axis alone then decreases chi2 at least as much as for the true residuals. The p-value is the
+fraction of flips that count, times the number of axes. If the brightness of the unocculted field gives a smaller
+p-value, that p-value is used.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ from psfcore.gap.evidence.linear_model import LinearModel, Step
 from psfcore.gap.evidence.responses import Evidence, ImageInfo
 
 SIGN_FLIPS = 999
-AS_GOOD = 0.3  # an axis of the best effect comes first if it explains at least this fraction of what the best axis explains
+# an axis of the best effect comes first if it explains at least this fraction of what the best axis explains
+AS_GOOD = 0.3
 SIGNIFICANT = 0.05  # axes with a p-value below this level come before the others
 SUSPECT = 2  # number of pointings that the report names
 
@@ -37,9 +38,9 @@ SUSPECT = 2  # number of pointings that the report names
 class Axis:
     """How much of the gap varies along one axis, and where the gap is largest.
 
-    share: fraction, 0 to 1. alone: the decrease of chi2 by this axis alone. at: the pointings with the largest residuals, and
-    the range of the axis in them. of_best: the axis comes first because the best effect varies along it, although another axis has a
-    larger share.
+    share: fraction, 0 to 1. alone: the decrease of chi2 by this axis alone. at: the pointings with the largest
+    residuals, and the range of the axis in them. of_best: the axis comes first because the best effect varies along it,
+    although another axis has a larger share.
     """
 
     name: str
@@ -170,8 +171,9 @@ def _kinds(values: Vector) -> Matrix | None:
 
 
 def _of_cells(model: LinearModel, designs: dict[str, list[Matrix]]) -> tuple[Matrix, Matrix]:
-    """Two results for the whitened cells of all discs: the patterns of the axes (patterns, cells), without the component
-    that a change of the PSF can absorb; and an orthonormal basis of this component (cells, coordinates)."""
+    """Two results for the whitened cells of all discs: the patterns of the axes (patterns, cells), without the
+    component that a change of the PSF can absorb; and an orthonormal basis of this component (cells, coordinates).
+    """
     base, each = list(model.evidence.base), enumerate(model.discs)
     rows = [np.vstack([patterns[k] for patterns in designs.values()]) @ disc.white for k, disc in each]
     design = np.hstack(rows)

@@ -1,15 +1,16 @@
-"""The calibration: how probable a group of alternatives must be to contain the true cause, from simulated cases of known cause.
+"""The calibration: how probable a group of alternatives must be to contain the true cause, from simulated cases of
+known cause.
 
-For each simulated case in which the gap is detected, take the probability at which the group of alternatives of the answer first
-contains a true cause: the smallest `level` of `answer.causes_of` whose causes cover it. Then
+For each simulated case in which the gap is detected, take the probability at which the group of alternatives of the
+answer first contains a true cause: the smallest `level` of `answer.causes_of` whose causes cover it. Then
 
     level = the k-th smallest of these probabilities,  k = ceil((n + 1) coverage)      Eq. (1)
 
-For a further case that is drawn like the simulated ones, the answer contains a true cause with at least this probability
-(split-conformal prediction; Vovk, Gammerman & Shafer 2005). No such guarantee holds for the effects of another author without a
-bound on how much they differ. The level is never below the coverage. If too many answers miss the true cause at every level up to
-MOST, no level has the coverage: then the level is the coverage itself, because larger groups only add wrong alternatives. `covered`
-states what the cases gave.
+For a further case that is drawn like the simulated ones, the answer contains a true cause with at least this
+probability (split-conformal prediction; Vovk, Gammerman & Shafer 2005). No such guarantee holds for the effects of
+another author without a bound on how much they differ. The level is never below the coverage. If too many answers miss
+the true cause at every level up to MOST, no level has the coverage: then the level is the coverage itself, because
+larger groups only add wrong alternatives. `covered` states what the cases gave.
 """
 
 from __future__ import annotations
@@ -46,7 +47,8 @@ class Calibration:
         if not 0 < coverage < 1 or rank > count:
             raise DataError(
                 "bad-coverage",
-                f"expected a coverage above 0 and at most {count / (count + 1):.3f}, for which {count} simulated cases are "
+                f"expected a coverage above 0 and at most {count / (count + 1):.3f}, for which {count} simulated "
+                "cases are "
                 f"enough; got {coverage:g}",
             )
         found = sorted(self.levels)[rank - 1]

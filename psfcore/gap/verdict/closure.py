@@ -5,26 +5,26 @@
     gap = sqrt(mean(residual^2 - noise^2))                                                    Eq. (3)
     deviance = r^T S^-1 r + ln det S,  S = 1 + J Cov J^T                                      Eq. (4)
 
-chi2_before and chi2_after are the chi2 of held-out images, without and with the effect in the model. nu is the value that
-chi2 would have without a gap. The first term of nu is the noise of the cells. The second term is the error of the fit, to
-which the held-out images did not contribute: Cov is the covariance of the fitted parameters, and J is the Jacobian of the
-held-out cells. In Eq. (3), residual and noise are those of the discs' means, in percent. In Eq. (4), the residuals r are
-in units of their noise.
+chi2_before and chi2_after are the chi2 of held-out images, without and with the effect in the model. nu is the value
+that chi2 would have without a gap. The first term of nu is the noise of the cells. The second term is the error of the
+fit, to which the held-out images did not contribute: Cov is the covariance of the fitted parameters, and J is the
+Jacobian of the held-out cells. In Eq. (3), residual and noise are those of the discs' means, in percent. In Eq. (4),
+the residuals r are in units of their noise.
 
 Eq. (4) is computed for all images of a fold at once. It is -2 ln of the likelihood of these images, as the fit predicts
 them. The prediction includes the uncertainty of the fitted parameters: if a fit states large errors, a large deviation
 increases its deviance only a little.
 
-Images are held out in two ways: blocks of time with a guard, and one pointing at a time. chi2 is summed over the cells of
-the discs. The chi2 of the blocks of the unocculted field is added under two conditions: these blocks show more of the gap
-than the discs do, and the effect explains more than half of what they show. A gain that differs between images is an
-example.
+Images are held out in two ways: blocks of time with a guard, and one pointing at a time. chi2 is summed over the cells
+of the discs. The chi2 of the blocks of the unocculted field is added under two conditions: these blocks show more of
+the gap than the discs do, and the effect explains more than half of what they show. A gain that differs between images
+is an example.
 
 The intervals are meant to contain the closure that the true cause would reach, not only our estimate. They combine four
 errors: a bootstrap over the images; the error of the noise scale in nu, which one simulation determines; the part of
 chi2_after that comes from errors of the effect's parameters; and a relative error FORM_ERROR of the effect's template.
-The part that comes from the parameters is drawn, fold by fold, from the covariance of the fit: its mean is the second term of
-nu, but a single direction with a large error often makes it several times as large.
+The part that comes from the parameters is drawn, fold by fold, from the covariance of the fit: its mean is the second
+term of nu, but a single direction with a large error often makes it several times as large.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ from psfcore.gap.evidence.linear_model import LinearModel
 from psfcore.transit.transit import Fold, folds
 
 RESAMPLES = 1000
-# Relative error of an effect's template; chi2_after contains its square times the chi2 of the gap. In a blind set of 120 cases (seed 36),
-# ghosts and persistence that the library describes differently had up to 0.37: of 17 intervals, 12 contained the truth with 0.15, and 16
-# with this value.
+# Relative error of an effect's template; chi2_after contains its square times the chi2 of the gap. In a blind set of
+# 120 cases (seed 36), ghosts and persistence that the library describes differently had up to 0.37: of 17 intervals, 12
+# contained the truth with 0.15, and 16 with this value.
 FORM_ERROR = 0.35
 INTERVAL = (5.0, 95.0)
 # A normal variable is below this number of standard deviations with a probability of 95 %.
@@ -67,11 +67,11 @@ class Interval:
 class HeldOut:
     """The results of a scheme of folds, for each held-out image with a disc. Images that no fold holds out are missing.
 
-    chi2, unocculted_chi2: chi2 of the cells, and of the blocks of the unocculted field. expected, unocculted_expected: the
-    values of the two chi2 without a gap. residual_pct: the mean of the disc, simulated minus observed, divided by the
-    observed mean. noise_pct: the error of this residual, including the error of the fit. deviance: Eq. (4) of each fold; the
-    key is the tuple of its held-out images. spread: for each fold, the parts of chi2 that independent errors of its fit add on
-    average, in the discs and in discs and blocks together.
+    chi2, unocculted_chi2: chi2 of the cells, and of the blocks of the unocculted field. expected, unocculted_expected:
+    the values of the two chi2 without a gap. residual_pct: the mean of the disc, simulated minus observed, divided by
+    the observed mean. noise_pct: the error of this residual, including the error of the fit. deviance: Eq. (4) of each
+    fold; the key is the tuple of its held-out images. spread: for each fold, the parts of chi2 that independent errors
+    of its fit add on average, in the discs and in discs and blocks together.
     """
 
     images: tuple[int, ...]
@@ -94,7 +94,9 @@ class HeldOut:
 
 
 def time_blocks(model: LinearModel) -> tuple[Fold, ...]:
-    """Folds that hold out one block of consecutive images each, with a guard; empty if there are fewer than six images."""
+    """Folds that hold out one block of consecutive images each, with a guard; empty if there are fewer than six
+    images.
+    """
     return folds(len(model.evidence.image_info))
 
 
@@ -185,7 +187,9 @@ def _deviance(left: Vector, along: Vector) -> float:
 def closure(
     before: HeldOut, after: HeldOut, rng: np.random.Generator, scale_error: float = 0.0
 ) -> Interval | None:
-    """Eq. (1) with its 90 % interval; None if there is no gap. scale_error: relative error of the scale of chi2 (noise variance)."""
+    """Eq. (1) with its 90 % interval; None if there is no gap. scale_error: relative error of the scale of chi2 (noise
+    variance).
+    """
     # A fold is skipped if it has too few images for the number of fitted parameters, so the images can differ.
     common, spread = sorted(set(before.images) & set(after.images)), after.spread.values()
     before, after = before.of(common), after.of(common)
@@ -215,7 +219,8 @@ def closure(
     value = 1 - float((chi2_after - nu).sum()) / total
     low, high = np.percentile(resampled, INTERVAL)
     high = max(high, np.percentile(without_errors, INTERVAL[1]))
-    # An error of the template only lowers the closure. No cause can close more than the whole gap: an estimate above 1 is noise.
+    # An error of the template only lowers the closure. No cause can close more than the whole gap: an estimate above 1
+    # is noise.
     excess = max(value - 1.0, 0.0)
     low, value = min(float(low) - excess, 1.0), value - excess
     return Interval(value, low, max(value, min(float(high) + FORM_ERROR**2, 1.0)))

@@ -1,13 +1,13 @@
 """A full refit: fit the PSF again to images from which the change by an effect was subtracted.
 
-Each round computes the change of the images by the effect, from the current scene and PSF. It subtracts this change from
-the images and fits the PSF again. Then it fits what remains of the effect together with the PSF. Two or three rounds
-converge, and the result is then more than a first-order approximation. A round is rejected if it leaves clearly more chi2 than an
-earlier round.
+Each round computes the change of the images by the effect, from the current scene and PSF. It subtracts this change
+from the images and fits the PSF again. Then it fits what remains of the effect together with the PSF. Two or three
+rounds converge, and the result is then more than a first-order approximation. A round is rejected if it leaves clearly
+more chi2 than an earlier round.
 
-The rounds use the Jacobian of the linear model from before the refit, because a new Jacobian takes most of the time of a round. The
-residuals are those of the current round, so the rounds converge to images without the effect all the same. After the
-last round, the Jacobian is computed once at the refit, and the remaining part is fitted with it.
+The rounds use the Jacobian of the linear model from before the refit, because a new Jacobian takes most of the time of
+a round. The residuals are those of the current round, so the rounds converge to images without the effect all the same.
+After the last round, the Jacobian is computed once at the refit, and the remaining part is fitted with it.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ WORSE_SHARE = 0.05
 class Corrected:
     """A full refit with effects in the model.
 
-    values: value, error and unit of each parameter of the effects; the value is summed over all rounds. model: the linear
-    model at the refit. rounds: number of rounds made.
+    values: value, error and unit of each parameter of the effects; the value is summed over all rounds. model: the
+    linear model at the refit. rounds: number of rounds made.
     """
 
     effects: tuple[Effect, ...]
@@ -66,7 +66,9 @@ class Corrected:
 
     @property
     def covariance(self) -> Vector:
-        """Covariance of the coordinates of the PSF, with the parameters of the effects free (coordinates, coordinates)."""
+        """Covariance of the coordinates of the PSF, with the parameters of the effects free (coordinates,
+        coordinates).
+        """
         evidence = self.model.evidence
         columns = tuple(c for effect in self.effects for c in evidence.columns[effect.name])
         base = len(evidence.base)
@@ -94,12 +96,13 @@ def add_to_model(
     view: View | None = None,
     progress: Progress = lambda stage, step, steps: None,
 ) -> Corrected:
-    """Fit the PSF and effects together with Gauss-Newton steps. The first step is the linear fit `found` in the linear model `model`.
+    """Fit the PSF and effects together with Gauss-Newton steps. The first step is the linear fit `found` in the linear
+    model `model`.
 
     A step that changes the PSF too much is shortened as a whole.
 
-    view: the view of the solution, if it exists already. Raises the errors of `invert` if the first round fails, DataError "effect-unseen" if the images do not constrain the
-    effects, and "bad-effects" if an added effect fails.
+    view: the view of the solution, if it exists already. Raises the errors of `invert` if the first round fails,
+    DataError "effect-unseen" if the images do not constrain the effects, and "bad-effects" if an added effect fails.
     """
     transit, shape = solution.transit, solution.inversion.shape
     # An effect that searches for a position keeps the position that it found first.
@@ -165,7 +168,9 @@ def add_to_model(
 
 
 def _with_old_jacobian(model: LinearModel, view: View, held: Sequence[Effect]) -> LinearModel:
-    """The linear model at another PSF: its residuals and its Jacobian of the PSF, with the Jacobian of the effects and the noise of `model`."""
+    """The linear model at another PSF: its residuals and its Jacobian of the PSF, with the Jacobian of the effects and
+    the noise of `model`.
+    """
     before, first = model.evidence, len(model.evidence.base)
     every = {effect.name: effect.parameters for effect in before.effects}
     numbers, columns = list[int](), dict[str, tuple[int, ...]]()
@@ -191,7 +196,8 @@ def _fit_remaining(model: LinearModel, held: Sequence[Effect], out: Vector) -> t
     if found.size != out.size:
         raise DataError(
             "effect-unseen",
-            f"expected the images to constrain all {out.size} parameters of {label_of([e.name for e in held])} after this effect "
+            f"expected the images to constrain all {out.size} parameters of {label_of([e.name for e in held])} after "
+            "this effect "
             f"was subtracted; the images constrain {found.size} of them: they may not contain this effect",
         )
     base = len(model.evidence.base)
@@ -210,14 +216,16 @@ def _those_that_act(effects: Sequence[Effect], acts: Flags) -> list[Effect]:
         if not part:
             raise DataError(
                 "effect-unseen",
-                f"expected {effect.name} to add light; its fit would remove light: the images do not contain this effect",
+                f"expected {effect.name} to add light; its fit would remove light: the images do not contain this "
+                "effect",
             )
         out.append(_with_part(effect, part))
     return out
 
 
 def _with_noise_of(before: Evidence, after: Evidence) -> Evidence:
-    """The evidence `after`, in which an effect is subtracted, with the noise of cells and blocks of the evidence `before`.
+    """The evidence `after`, in which an effect is subtracted, with the noise of cells and blocks of the evidence
+    `before`.
 
     The subtraction removes the light of the effect from the images, but not the photon noise of this light. The
     reference level of percentages is also taken from `before`.

@@ -1,20 +1,20 @@
 """The limits: what the data of a transit could have shown, and which effects they cannot tell apart.
 
-The strength of an effect is the value t of one of its parameters while its other parameters are 0. Then the score of the columns
-H of the effect (`closed_form`) is
+The strength of an effect is the value t of one of its parameters while its other parameters are 0. Then the score of
+the columns H of the effect (`closed_form`) is
 
     s_H = t N_Hj + z,    z ~ Normal(0, N_HH)                                                             Eq. (1)
 
-found_90 is the smallest strength at which the effect alone excludes "no cause" FLOOR to 1 (`answer`) with a probability of 90 %:
-the 10 % quantile of its ln E over DRAWS of z. The strength of a random field is the standard deviation of its coefficients; they are
-drawn too.
+found_90 is the smallest strength at which the effect alone excludes "no cause" FLOOR to 1 (`answer`) with a probability
+of 90 %: the 10 % quantile of its ln E over DRAWS of z. The strength of a random field is the standard deviation of its
+coefficients; they are drawn too.
 
-excluded_95 is the 95 % quantile of the strength, fitted beside the told causes: a Gaussian with the fitted value and its error,
-cut at 0 for a parameter that cannot be negative. For a random field it is the quantile of the likelihood of the data as a function of
-the standard deviation.
+excluded_95 is the 95 % quantile of the strength, fitted beside the told causes: a Gaussian with the fitted value and
+its error, cut at 0 for a parameter that cannot be negative. For a random field it is the quantile of the likelihood of
+the data as a function of the standard deviation.
 
-The distance of two effects is the square root of the chi2 that remains if the second one is fitted to the change by the first
-one at found_90. Below ALIKE the data cannot tell them apart.
+The distance of two effects is the square root of the chi2 that remains if the second one is fitted to the change by the
+first one at found_90. Below ALIKE the data cannot tell them apart.
 """
 
 from __future__ import annotations
@@ -48,7 +48,8 @@ RMS = "rms"  # the parameter of a random field: the standard deviation of its co
 class ParameterLimits:
     """The limits of one parameter, in its unit.
 
-    likely: the largest plausible size. found_90: None if no strength would be found. excluded_95: None before there are data.
+    likely: the largest plausible size. found_90: None if no strength would be found. excluded_95: None before there are
+    data.
     """
 
     name: str
@@ -82,7 +83,9 @@ class EffectLimits:
         return min(self.parameters, key=multiple)
 
     def as_json(self, *, observed: bool = True) -> dict[str, Any]:
-        """The limits of the leading parameter. If the effect has several parameters, the limits of all parameters are added."""
+        """The limits of the leading parameter. If the effect has several parameters, the limits of all parameters are
+        added.
+        """
         content = {"parameter": self.leading.name} | self.leading.as_json(observed=observed)
         if len(self.parameters) > 1:
             content["parameters"] = {one.name: one.as_json(observed=observed) for one in self.parameters}
@@ -130,7 +133,9 @@ class Limits:
 
 
 def limits(closed: ClosedForm, beside: Sequence[Variant] = (), *, observed: bool = True) -> Limits:
-    """The limits of all effects. beside: the told causes. observed: whether the data are real; only then they can exclude strengths."""
+    """The limits of all effects. beside: the told causes. observed: whether the data are real; only then they can
+    exclude strengths.
+    """
     evidence = closed.model.evidence
     own = {
         form.effect: form for form in closed.forms if form.field is None and form.effect and not form.is_sun
@@ -164,7 +169,9 @@ def limits(closed: ClosedForm, beside: Sequence[Variant] = (), *, observed: bool
 
 
 def _found(closed: ClosedForm, form: Form, k: int | None, least: float) -> float | None:
-    """found_90 of parameter k of an effect; of the standard deviation of a random field (None). least: the smallest ln E that is found."""
+    """found_90 of parameter k of an effect; of the standard deviation of a random field (None). least: the smallest ln
+    E that is found.
+    """
     normal = closed.normal(form.columns)
     values, vectors = np.linalg.eigh(normal)
     rng = np.random.default_rng(SEED)
@@ -191,7 +198,9 @@ def _found(closed: ClosedForm, form: Form, k: int | None, least: float) -> float
 
 
 def _first_found(margin: Callable[[float], float], unit: float, most: float) -> float | None:
-    """The smallest strength, up to `most`, for which `margin` is at least 0; None if there is none. unit: the error of the strength."""
+    """The smallest strength, up to `most`, for which `margin` is at least 0; None if there is none. unit: the error of
+    the strength.
+    """
     if most <= WEAKEST_TRIED * unit:
         return None
     tried = np.geomspace(WEAKEST_TRIED * unit, min(STRONGEST_TRIED * unit, most), TRIED)

@@ -1,24 +1,24 @@
 """Cross-validation of a fit: hold out blocks of images and bootstrap the rest, in many runs; bands over all fits.
 
 Source: Hofmeister et al., The point-spread function of HRI_EUV, section "Results". The images are divided into ten
-blocks in the order of time (fewer blocks if there are fewer than 30 images). Each block is held out once, with a guard on
-both sides. In all other blocks, images are resampled with replacement (bootstrap). Ten runs give 100 PSFs. There are two
-schemes.
+blocks in the order of time (fewer blocks if there are fewer than 30 images). Each block is held out once, with a guard
+on both sides. In all other blocks, images are resampled with replacement (bootstrap). Ten runs give 100 PSFs. There are
+two schemes.
 
 Shared: the fit of a fold differs by a small step from the fit to all images. The contributions of the images to the
 normal equations give this step directly:
 
     q_f = q + (sum over images of k_i A_i)^-1 sum over images of k_i v_i        Eq. (1)
 
-where k_i is the number of times that image i occurs in the bootstrap sample. All folds share the reconstructed scenes, so
-this scheme costs almost no time. Its error is of second order in the step.
+where k_i is the number of times that image i occurs in the bootstrap sample. All folds share the reconstructed scenes,
+so this scheme costs almost no time. Its error is of second order in the step.
 
 Exact: every fold is fitted separately. The fit starts from the PSF of Eq. (1) and from the scenes of the fit to all
 images, so it converges in one or two rounds. The occulters are located again, and the scenes are iterated until they
 converge.
 
-If the scatter is isotropic, every sample is also fitted without a formula (`free_shells`). The free fit is compared with
-the formula:
+If the scatter is isotropic, every sample is also fitted without a formula (`free_shells`). The free fit is compared
+with the formula:
 
     excess within R = sum over shells within R of (free - formula)              Eq. (2)
 
@@ -191,7 +191,8 @@ def shared_step(solution: Solution, sample: FoldSample) -> Vector:
     if not counted or np.linalg.cond(normal) > 1e12:
         raise DataError(
             "transit-says-too-little",
-            f"run {sample.run}, fold {sample.fold}: expected images that determine all parameters; got too few: add images",
+            f"run {sample.run}, fold {sample.fold}: expected images that determine all parameters; got too few: add "
+            "images",
         )
     return np.asarray(np.linalg.solve(normal, np.sum([k * f.score for k, f in counted], axis=0)))  # Eq. (1)
 
@@ -217,7 +218,8 @@ def exact_fit(
         held_out[n] = float(-100 * residual.mean() / (expected + residual).mean())
     shares = None
     if solution.inversion.shape.isotropic:
-        # The last step of the fit changed the PSF by a negligible amount but did not update the scenes. Update them here.
+        # The last step of the fit changed the PSF by a negligible amount but did not update the scenes. Update them
+        # here.
         for step, n in enumerate(fitted.part):
             progress("settling", step, len(fitted.part))
             sky.improve(n, fitted.optics, SETTLE_STEPS)
@@ -257,12 +259,12 @@ def _fold_fit(
 class ShellBands:
     """The free fits and the formulas of all samples, shell by shell.
 
-    Arrays (5, shells) contain percentiles over the samples, at -2, -1, 0, +1 and +2 sigma. "law" stands for the formula.
-    edges_px: edges of the shells, (shells + 1,). free_weight, law_weight: weight per pixel of each shell, (5, shells).
-    free_beyond_pct, law_beyond_pct: percentage of the light that is scattered beyond the inner edge of each shell,
-    (5, shells). excess_pct: excess of Eq. (2) within the outer edge of each shell, in percentage points of all light,
-    (5, shells). excess_sigma: error of the excess, (shells,). law_within_pct: median of the formula's light within the
-    outer edge of each shell, (shells,).
+    Arrays (5, shells) contain percentiles over the samples, at -2, -1, 0, +1 and +2 sigma. "law" stands for the
+    formula. edges_px: edges of the shells, (shells + 1,). free_weight, law_weight: weight per pixel of each shell, (5,
+    shells). free_beyond_pct, law_beyond_pct: percentage of the light that is scattered beyond the inner edge of each
+    shell, (5, shells). excess_pct: excess of Eq. (2) within the outer edge of each shell, in percentage points of all
+    light, (5, shells). excess_sigma: error of the excess, (shells,). law_within_pct: median of the formula's light
+    within the outer edge of each shell, (shells,).
     """
 
     edges_px: Vector
@@ -341,9 +343,9 @@ class Excess:
 class Bands:
     """Medians and bands of all samples: percentiles at -2, -1, 0, +1 and +2 sigma.
 
-    curve_pct: percentiles of C(R) at radii_px, (5, radii). values: percentiles of each parameter, (5,). totals: the total
-    of scatter of each fit. held_out_pct: mean residual of each held-out image, percent. shells: percentiles by shell;
-    None if the formula is not isotropic.
+    curve_pct: percentiles of C(R) at radii_px, (5, radii). values: percentiles of each parameter, (5,). totals: the
+    total of scatter of each fit. held_out_pct: mean residual of each held-out image, percent. shells: percentiles by
+    shell; None if the formula is not isotropic.
     """
 
     radii_px: Vector

@@ -9,23 +9,23 @@ v of its Eq. (3). The unknown d contains, for each shell, the light of the free 
     minimise over d >= -l   sum w (r - J d)^2 + sum ((d - d_f) / s)^2,   J = D H D G c   Eq. (2)
 
 c_S is the change of the image when light moves from the centre to shell S. A_S and B are computed from the diffracted
-scene. Eq. (1) includes the change of the scene, as Eq. (4) of that module does: D [c - H (1 - D) G c] equals D H D G c if
-H G = 1. G c consists of ring sums of G B. All shells together therefore need only the ring sums of one image and one
-small matrix product. Compared with the exact derivatives, J is accurate to a few percent; for discs near the edge of the
-field, it is accurate to a tenth. r is exact.
+scene. Eq. (1) includes the change of the scene, as Eq. (4) of that module does: D [c - H (1 - D) G c] equals D H D G c
+if H G = 1. G c consists of ring sums of G B. All shells together therefore need only the ring sums of one image and one
+small matrix product. Compared with the exact derivatives, J is accurate to a few percent; for discs near the edge of
+the field, it is accurate to a tenth. r is exact.
 
 The normal equations are sums over images: the fit of a bootstrap sample uses the sums of J^T w J and J^T w r over the
 images of the sample.
 
-Differences from the paper: all dark pixels are used, with weights from their noise, instead of a thousand pixels selected
-by shell. A Gaussian prior of width s about the formula constrains every shell. Near the centre the prior is so wide that
-the images determine the shells. Far from the centre the prior is narrow, and the images add little. Without the prior,
-the innermost shells cannot be separated from the centre, and the light beyond the field is undetermined.
+Differences from the paper: all dark pixels are used, with weights from their noise, instead of a thousand pixels
+selected by shell. A Gaussian prior of width s about the formula constrains every shell. Near the centre the prior is so
+wide that the images determine the shells. Far from the centre the prior is narrow, and the images add little. Without
+the prior, the innermost shells cannot be separated from the centre, and the light beyond the field is undetermined.
 
 | symbol | name | unit |
 |---|---|---|
 | d | step: light of a shell in the free fit minus its light in the formula | fraction of all light |
-| d_f | towards: light of a shell in the formula fitted to the sample, minus its light in the formula of the fitted PSF (l) | fraction of all light |
+| d_f | towards: light of a shell in the formula fitted to the sample, minus l | fraction of all light |
 | l | law_light: light of the formula in the fitted PSF | fraction of all light |
 | A_S | ring sum: sum of the diffracted scene over the pixels of shell S around a pixel | DN/s px^2 |
 | B | the diffracted scene: the scene convolved with the diffraction PSF, not with the scatter | DN/s |

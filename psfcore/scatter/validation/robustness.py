@@ -2,24 +2,25 @@
 
 Source: Hofmeister et al., The point-spread function of HRI_EUV, section "Accuracy and robustness".
 
-Its last experiment repeats the fit with an offset added to every readout, as a wrong dark level would add it. An offset of o DN adds o / t DN/s to an image with exposure time t, Eq. (1). The effect is largest for short exposures
-while the occulter is far from the limb. A pixel of the disc then contains only a few tens of DN.
+Its last experiment repeats the fit with an offset added to every readout, as a wrong dark level would add it. An offset
+of o DN adds o / t DN/s to an image with exposure time t, Eq. (1). The effect is largest for short exposures while the
+occulter is far from the limb. A pixel of the disc then contains only a few tens of DN.
 
 Two quantities are compared with the fit without an offset. The first is the diffuse weight: the weight of the scatter
-kernel per pixel, averaged over rings one pixel wide. It is compared only within the field, because the PSF farther out is
-an extrapolation of the formula. The second is the cumulative curve C(R) = 100 (1 - encircled energy) of the scatter kernel,
-as in the paper, and also of the total PSF.
+kernel per pixel, averaged over rings one pixel wide. It is compared only within the field, because the PSF farther out
+is an extrapolation of the formula. The second is the cumulative curve C(R) = 100 (1 - encircled energy) of the scatter
+kernel, as in the paper, and also of the total PSF.
 
-The shapes are compared with the fitted shape on held-out images. Every shape is the softened power law with one or two additional parameters. If these are zero, the shape equals the power law. Near the
-solution, the model is nearly linear in the parameters. One pass over the images therefore gives the normal equations of
-all shapes. The fit of a fold, and its gain on held-out images, follow from sums of these equations. The gain is the
-decrease of chi2 (to first order):
+The shapes are compared with the fitted shape on held-out images. Every shape is the softened power law with one or two
+additional parameters. If these are zero, the shape equals the power law. Near the solution, the model is nearly linear
+in the parameters. One pass over the images therefore gives the normal equations of all shapes. The fit of a fold, and
+its gain on held-out images, follow from sums of these equations. The gain is the decrease of chi2 (to first order):
 
     q_f = q + A_f^-1 v_f,   A_f, v_f summed over the fitted frames of fold f             Eq. (2)
     gain = sum over folds f of (2 d . v_h - d . A_h d),   d = q_f - q                        Eq. (3)
 
-The reported gain is the gain of the shape minus the gain of the softened power law, which is refitted in the same folds.
-The reported gain can be negative: a parameter that fits noise makes the prediction of held-out images worse.
+The reported gain is the gain of the shape minus the gain of the softened power law, which is refitted in the same
+folds. The reported gain can be negative: a parameter that fits noise makes the prediction of held-out images worse.
 
 | symbol | name |
 |---|---|
@@ -55,8 +56,8 @@ class DarkOffset:
     """The fit with one offset, compared with the fit without an offset.
 
     weight_change_pct: relative change of the diffuse weight per pixel at radii_px, percent. curve_change_points,
-    total_curve_change_points: change of C(R) of the scatter kernel and of the total PSF at curve_radii_px, in percentage
-    points. images: number of fitted images.
+    total_curve_change_points: change of C(R) of the scatter kernel and of the total PSF at curve_radii_px, in
+    percentage points. images: number of fitted images.
     """
 
     offset_dn: float

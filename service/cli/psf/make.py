@@ -127,7 +127,9 @@ def crossval(
     plot: Path | None,
     **parameters: Any,
 ) -> None:
-    """Estimate the uncertainty of the fit to TRANSIT: hold out blocks of images and bootstrap the other images, in many runs."""
+    """Estimate the uncertainty of the fit to TRANSIT: hold out blocks of images and bootstrap the other images, in many
+    runs.
+    """
     with connection() as service, progress_bar() as report:
         found = service.cross_validate(
             transit,
@@ -170,7 +172,9 @@ def show(file: Path, plot: Path | None, overwrite: bool) -> None:
 
 
 def _mask_of(instrument: str, folder: str) -> Path | None:
-    """The mask image that the user's instrument file names, as a FITS file in this folder; None if it names no mask image."""
+    """The mask image that the user's instrument file names, as a FITS file in this folder; None if it names no mask
+    image.
+    """
     if not instrument.endswith(".toml"):
         return None
     from astropy.io import fits

@@ -1,7 +1,8 @@
-"""Commands that read PSFs: those that others published (``psf published``, ``psf get``), those in files or on a service (``psf query``,
-``cutout``, ``rebin``), and the built PSFs that are kept (``cache``).
+"""Commands that read PSFs: those that others published (``psf published``, ``psf get``), those in files or on a service
+(``psf query``, ``cutout``, ``rebin``), and the built PSFs that are kept (``cache``).
 
-For a file the tables are computed in this process; for an id the service reads its stored tables. Both give the same answers.
+For a file the tables are computed in this process; for an id the service reads its stored tables. Both give the same
+answers.
 """
 
 from __future__ import annotations
@@ -68,8 +69,8 @@ def list_published() -> None:
 def get_psfs(names: tuple[str, ...], source: Path | None) -> None:
     """Bring published PSFs, whose names then stand for them: `heliopsf deconvolve --psf NAME`.
 
-    A broken download is tried again; it is kept only if it has the published checksum. HELIOPSF_CACHE_DIR names the folder that
-    keeps them; several machines may share it.
+    A broken download is tried again; it is kept only if it has the published checksum. HELIOPSF_CACHE_DIR names the
+    folder that keeps them; several machines may share it.
     """
     for name in names:
         brought(name, source)
@@ -172,7 +173,8 @@ def cache() -> None:
     """List and remove the built PSFs that are kept in your cache folder. No service is needed.
 
     Commands with --local and the Python functions build a PSF once and keep it there. HELIOPSF_CACHE_DIR names another
-    folder, HELIOPSF_CACHE_MIB the largest size (default: 2048; 0: keep nothing). A service keeps its PSFs in its own data folder.
+    folder, HELIOPSF_CACHE_MIB the largest size (default: 2048; 0: keep nothing). A service keeps its PSFs in its own
+    data folder.
     """
 
 
@@ -208,8 +210,9 @@ def _named(provenance: dict[str, Any]) -> str:
 
 @contextmanager
 def _asking(psf: str, other: str | None) -> Iterator[dict[str, Callable[..., dict[str, Any]]]]:
-    """The functions that answer questions about a PSF, and compare it with another one: the service answers for ids; for
-    files the tables are computed here."""
+    """The functions that answer questions about a PSF, and compare it with another one: the service answers for ids;
+    for files the tables are computed here.
+    """
     psfs = [psf] if other is None else [psf, other]
     if len({is_psf_id(one) for one in psfs}) > 1:
         raise click.UsageError(
@@ -290,7 +293,8 @@ def _compare_lines(answer: dict[str, Any]) -> list[str]:
         for name, row in answer["difference_points"].items()
     }
     return [
-        f"{other['name']} {other['version']} minus {one['name']} {one['version']}: sum {answer['difference_of_sums']:+.6f}, "
+        f"{other['name']} {other['version']} minus {one['name']} {one['version']}: sum "
+        f"{answer['difference_of_sums']:+.6f}, "
         f"central pixel {answer['difference_of_central_weights']:+.5f}; light beyond R in percentage points:",
         *_table([*(f"{radii[n]:g}" for n in shown), "largest"], columns),
     ]

@@ -1,5 +1,6 @@
-"""Commands about the PSFs that a service keeps: ``heliopsf psf list``, ``upload``, ``certify``, ``series``, ``lineage``, ... and
-``heliopsf context``."""
+"""Commands about the PSFs that a service keeps: ``heliopsf psf list``, ``upload``, ``certify``, ``series``,
+``lineage``, ... and ``heliopsf context``.
+"""
 
 from __future__ import annotations
 
@@ -116,7 +117,8 @@ def instruments() -> None:
 
     for instrument in map(load_instrument, instrument_names()):
         echo(
-            f"{instrument.name:<12}  {instrument.wavelength_angstrom:6.1f} angstrom  {instrument.version}  {instrument.status}  "
+            f"{instrument.name:<12}  {instrument.wavelength_angstrom:6.1f} angstrom  {instrument.version}  "
+            f"{instrument.status}  "
             f"`heliopsf psf build --instrument {instrument.name} -o FILE`"
         )
 
@@ -192,8 +194,9 @@ def best(
     service: Client, image: Path | None, json_file: Path | None, overwrite: bool, **filters: Any
 ) -> None:
     """With --image, show the PSF that `heliopsf deconvolve` would use for the image, and why. Without it, find the PSF
-    with the given properties. With --image and a --kind other than total, only certified PSFs or the PSFs of a context are
-    searched."""
+    with the given properties. With --image and a --kind other than total, only certified PSFs or the PSFs of a context
+    are searched.
+    """
     filters = without_none(filters)
     if image is not None and set(filters) - {"context", "kind"}:
         raise click.UsageError(
@@ -264,8 +267,9 @@ def rerun(
 def series(service: Client, series: str | None, interpolated: bool | None, reason: str) -> None:
     """List the series of which a PSF was certified, or say whether the PSFs of SERIES may be interpolated in time.
 
-    SERIES is instrument/channel/kind, such as hri_euv/174/total. If its PSFs may be interpolated, an image whose time is
-    between the ranges of two certified PSFs is deconvolved with a PSF between the two. Contexts that exist do not change.
+    SERIES is instrument/channel/kind, such as hri_euv/174/total. If its PSFs may be interpolated, an image whose time
+    is between the ranges of two certified PSFs is deconvolved with a PSF between the two. Contexts that exist do not
+    change.
     """
     if (series is None) != (interpolated is None):
         raise click.UsageError(
@@ -304,7 +308,8 @@ def interpolate(
     output: Path | None,
     overwrite: bool,
 ) -> None:
-    """Interpolate between two fitted PSFs, BEFORE and AFTER, in time. Both must have the same shape and diffraction PSF.
+    """Interpolate between two fitted PSFs, BEFORE and AFTER, in time. Both must have the same shape and diffraction
+    PSF.
 
     The new PSF is a draft. `heliopsf psf series --interpolate` lets deconvolutions do this by themselves.
     """
@@ -385,7 +390,8 @@ def use(service: Client, name: str | None, no_context: bool, reason: str) -> Non
 
 def _choice(service: Client, image: Path, context: str | None) -> Row:
     """The PSF that a deconvolution of an image would use, and why. If the PSF is not built yet, only its entry in the
-    estimate is known."""
+    estimate is known.
+    """
     image_id = service.upload_image(image)["id"]
     choice: Row = service.estimate("deconvolve", image_id=image_id, context=context)["psf"]
     return {"psf": choice if choice["status"] is None else service.psf(choice["id"]), "why": choice["why"]}
@@ -396,7 +402,8 @@ def _limit(service: Client, psf_id: str, name: str, option: str) -> str:
     at: str | None = service.psf(psf_id)[name]
     if at is None:
         raise click.UsageError(
-            f"expected {option}, because PSF {short(psf_id)} has no {'end' if name == 'valid_to' else 'start'} of a range of times"
+            f"expected {option}, because PSF {short(psf_id)} has no {'end' if name == 'valid_to' else 'start'} of a "
+            "range of times"
         )
     return at
 

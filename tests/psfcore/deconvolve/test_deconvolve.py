@@ -1,4 +1,5 @@
-"""Richardson-Lucy by itself: its flux, saturated cores, negative pixels, a real image, and PSFs much larger than the image."""
+"""Richardson-Lucy by itself: its flux, saturated cores, negative pixels, a real image, and PSFs much larger than the
+image."""
 
 from __future__ import annotations
 
@@ -81,8 +82,8 @@ def test_progress_reports_steps_and_its_exceptions_pass_through() -> None:
 
 
 def test_on_a_real_image_bright_rises_and_dark_falls(real: Callable[[str], Path]) -> None:
-    """The paper: bright features rise by up to 40 %, dark regions fall by up to 85 %. The test uses a part of the image,
-    and means of 8 x 8 px, so that pixel noise does not count as structure."""
+    """The paper: bright features rise by up to 40 %, dark regions fall by up to 85 %. The test uses a part of the
+    image, and means of 8 x 8 px, so that pixel noise does not count as structure."""
     whole = read_observation(real("eui/derived_hrieuv174_20220401T103005920_pseudolinear.fits"), LIMITS)
     part = np.s_[512:1536, 512:1536]
     image = Image(whole.pixels[part], whole.mask[part], whole.header, whole.unit, whole.exposure_s)

@@ -1,4 +1,5 @@
-"""The memory of a deconvolution: the sizes that it is estimated from, what is refused, and the cache of prepared PSFs."""
+"""The memory of a deconvolution: the sizes that it is estimated from, what is refused, and the cache of prepared
+PSFs."""
 
 from __future__ import annotations
 

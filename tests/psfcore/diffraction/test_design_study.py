@@ -59,7 +59,8 @@ def test_the_trends_with_pitch_and_wire(study: DesignStudy) -> None:
 
 
 def test_orders_of_a_flare_as_wide_as_their_spacing_overlap() -> None:
-    """Of a flare of 5 px, orders 9.1 px apart are separate, orders 5.7 px apart overlap. Without scatter there is no ratio."""
+    """Of a flare of 5 px, orders 9.1 px apart are separate, orders 5.7 px apart overlap. Without scatter there is no
+    ratio."""
     hri = replace(load_instrument("hri_euv"), scatter=None)
     separate, overlapping = design_study(hri, [800.0, 1270.0], [40.0]).rows
     assert separate.peak_visibility == 1 and separate.peak_over_scatter is None

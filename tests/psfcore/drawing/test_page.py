@@ -45,7 +45,8 @@ How to read
 {% endcall %}
 {% call section("Folded") %}
 <details><summary>{{ name }}</summary>
-{% call table(["file", "", "residual (%)"], [(name, "", "1.0 ± 0.2"), ("b", "c", "-3 to 4")]) %}Caption of {{ name }}.{% endcall %}
+{% call table(["file", "", "residual (%)"], [(name, "", "1.0 ± 0.2"), ("b", "c", "-3 to 4")]) -%}
+Caption of {{ name }}.{% endcall %}
 {% call figure(second, "second") %}Second, {{ name }}, to be read.{% endcall %}
 </details>
 {{ provenance_values({"file": {"name_of": name}, "none": none}) }}

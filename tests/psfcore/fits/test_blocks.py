@@ -116,7 +116,8 @@ def test_a_gzip_file_may_have_a_name_a_comment_several_members_and_zeros(tmp_pat
 
 
 def test_a_gzip_bomb_is_refused_and_no_pixel_is_inflated(tmp_path: Path) -> None:
-    """A file of a few kilobytes declares a table of 300 GB before the image, or holds more bytes than the limits allow."""
+    """A file of a few kilobytes declares a table of 300 GB before the image, or holds more bytes than the limits
+    allow."""
     rows = 3 * 10**11 // 8
     cards = ["BITPIX  = 8", "NAXIS   = 2", "NAXIS1  = 8", f"NAXIS2  = {rows}", "PCOUNT  = 0", "GCOUNT  = 1"]
     path = tmp_path / "bomb.fits.gz"

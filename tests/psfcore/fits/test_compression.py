@@ -1,4 +1,5 @@
-"""Compressed images: wrong parameters are refused in the header, and wrong tiles before a decoder or the memory sees them."""
+"""Compressed images: wrong parameters are refused in the header, and wrong tiles before a decoder or the memory sees
+them."""
 
 from __future__ import annotations
 
@@ -47,7 +48,9 @@ def codec_settings(**values: object) -> bytes:
 BAD_CARDS = {
     "TFIELDS of 1000": compressed(TFIELDS=1000),
     "TFIELDS of 2^32 in a table before the image": table_before_an_image(f"TFIELDS = {2**32}"),
-    "ZNAXIS of 2^32 in a table before the image": table_before_an_image("TFIELDS = 0", f"ZNAXIS  = {2**32}", "ZIMAGE  = 1"),
+    "ZNAXIS of 2^32 in a table before the image": table_before_an_image(
+        "TFIELDS = 0", f"ZNAXIS  = {2**32}", "ZIMAGE  = 1"
+    ),
     "PCOUNT negative": compressed(PCOUNT=-1),
     "BYTEPIX 8": codec_settings(BLOCKSIZE=32, BYTEPIX=8),
     "BYTEPIX 4 of pixels of 2 bytes": codec_settings(BYTEPIX=4),
@@ -64,7 +67,7 @@ BAD_CARDS = {
     "PCOUNT of a plain image": block(*image_cards(32, 16, 16, "PCOUNT  = 8"), data=bytes(2000)),
     "GCOUNT of a plain image": block(*image_cards(32, 16, 16, "GCOUNT  = 2"), data=bytes(4000)),
     "an END with a comment": good().replace(b"END " + b" " * 76, b"END / it ends".ljust(80) + b"X" * 0, 1),
-}  # fmt: skip
+}
 
 
 def test_a_count_or_parameter_outside_the_standard_is_refused_in_the_header(
@@ -91,9 +94,11 @@ BAD_TABLES = {
     "a keyword that is a pattern": compressed(**{"ZTILE*": 1}),
     "a keyword that is no pattern": compressed(**{"ZTIL?[J": 1}),
     "a long pattern": compressed().replace(
-        b"ZCMPTYPE= ", b"HIERARCH TFORM" + b"*A" * 20 + b"B = 1" + b" " * 21 + b"HIERARCH TFORM" + b"A" * 40 + b" = 1" + b" " * 22 + b"ZCMPTYPE= "
+        b"ZCMPTYPE= ",
+        b"HIERARCH TFORM" + b"*A" * 20 + b"B = 1" + b" " * 21 + b"HIERARCH TFORM" + b"A" * 40 + b" = "
+        b"1" + b" " * 22 + b"ZCMPTYPE= ",
     ),
-}  # fmt: skip
+}
 
 
 def test_a_table_that_contradicts_itself_is_refused_by_the_decoder(
@@ -138,8 +143,8 @@ for path in sys.argv[1:]:
 def test_the_decoder_never_sees_what_it_cannot_handle(tmp_path: Path) -> None:
     """In a process that may use 600 MiB of private memory, because a wrong parameter could crash the decoder.
 
-    With BYTEPIX 8, it would return as much memory of the process as pixels. astropy makes a list of TFIELDS columns, and
-    looks at the second HDU when it opens a file.
+    With BYTEPIX 8, it would return as much memory of the process as pixels. astropy makes a list of TFIELDS columns,
+    and looks at the second HDU when it opens a file.
     """
     pixels = np.arange(40 * 50, dtype=np.int16).reshape(40, 50)
     packed = fits.CompImageHDU(pixels, compression_type="RICE_1")

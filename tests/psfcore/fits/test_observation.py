@@ -248,7 +248,8 @@ def test_lost_blocks_are_masked_and_dark_pixels_are_not() -> None:
 
 
 def test_rows_that_were_not_received_and_counts_that_wrapped() -> None:
-    """Rows of zeros beside a faint corona, whose own zeros stay; and a peak that passes through all negative numbers of 16 bits."""
+    """Rows of zeros beside a faint corona, whose own zeros stay; and a peak that passes through all negative numbers of
+    16 bits."""
     rng = np.random.default_rng(5)
     y, x = np.indices((256, 256))
     faint = rng.poisson(np.where(np.hypot(y - 128, x - 128) < 90, 300.0, 1.5)).astype(float)

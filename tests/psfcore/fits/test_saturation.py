@@ -97,7 +97,8 @@ def test_no_false_alarm_on_simulated_images_and_clipped_ones_found() -> None:
 
 
 def test_what_is_doubtful_is_told() -> None:
-    """Few equal pixels; clipping below the known level; and saturated pixels that the header counts and the image lacks.
+    """Few equal pixels; clipping below the known level; and saturated pixels that the header counts and the image
+    lacks.
 
     The request has the last word.
     """
@@ -121,7 +122,8 @@ def test_what_is_doubtful_is_told() -> None:
 
 
 def test_the_chance_is_the_poisson_probability() -> None:
-    """Nine pixels have the largest value; below it, two pixels have each value. The image has several blocks of rows."""
+    """Nine pixels have the largest value; below it, two pixels have each value. The image has several blocks of
+    rows."""
     pixels = np.concatenate([np.repeat(np.arange(0.0, 2400.0), 2), np.full(9, 5000.0), np.full(791, -1.0)])
     pixels = np.random.default_rng(1).permutation(pixels).reshape(700, 8)
     valid = np.ones(pixels.shape, bool)

@@ -1,4 +1,5 @@
-"""The measurement recovers the arms of a simulated flare, and its stated errors cover the true values; and its parts."""
+"""The measurement recovers the arms of a simulated flare, and its stated errors cover the true values; and its
+parts."""
 
 from __future__ import annotations
 

@@ -138,7 +138,8 @@ def spacing_px(instrument: Instrument, mesh: Mesh) -> float:
 
 
 def test_the_meshes_have_the_measured_arms_and_orders() -> None:
-    """A square mesh has two arms, 90 degrees apart. The measured spacing gives a pitch within 1 % of the nominal one."""
+    """A square mesh has two arms, 90 degrees apart. The measured spacing gives a pitch within 1 % of the nominal
+    one."""
     for channel, (arms_deg, entrance_px, focal_px) in MEASURED.items():
         aia = load_instrument(f"aia_{channel}")
         *entrance, focal = aia.meshes
@@ -154,8 +155,8 @@ def test_the_meshes_have_the_measured_arms_and_orders() -> None:
 
 
 def test_the_arms_of_trace_and_euvi_have_the_published_spacing_direction_and_light() -> None:
-    """TRACE: orders of 70 lines an inch at 19.4 px, arms at +-45 degrees, about 20 % of the light (Lin et al. 2001). EUVI: the
-    fine mesh of 0.36 mm with 82 % open, and the coarse grid of 5 mm with 98 % open."""
+    """TRACE: orders of 70 lines an inch at 19.4 px, arms at +-45 degrees, about 20 % of the light (Lin et al. 2001).
+    EUVI: the fine mesh of 0.36 mm with 82 % open, and the coarse grid of 5 mm with 98 % open."""
     published = {
         "trace_171": (19.4, 45.0, 20.0),
         "euvi_284": (10.1, 45.0, 18.0),

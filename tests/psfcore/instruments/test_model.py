@@ -74,13 +74,19 @@ FAULTS = [
         "mount.polygons.0.corners_mm.1.1: expected this entry; got none",
     ),
     (("", MOUNT + MASK.replace("a.png\\n", "../secret.png")), "mount.mask_image.file: expected a text of the form"),
-    (("", '[scatter]\nb_px = 6.0\ntotal = 0.5\nbasis = "fitted"\n'), "scatter: expected one shape: b_px and c, or laws, or table; got b_px"),
-    (("", '[scatter]\ntotal = 0.5\nbasis = "fitted"\n'), "scatter: expected one shape: b_px and c, or laws, or table; got none of them"),
-    (("", '[scatter]\ntable = [[2, 1], [1, 1]]\ntotal = 0.5\nbasis = "fitted"\n'), "scatter: table: expected at least two rows [radius_px, weight]"),
-    (("4.0", "4.0\nsector = { first_angle_deg = 0, opening_deg = 360 }"), "aperture.sector.opening_deg: expected a number of at most 359; got 360"),
-    (("4.0", "4.0\ncorners_mm = [[0, 0], [1, 0], [1, 2]]"), "aperture: expected corners_mm within 2.0 mm of the axis; got a corner at 2.23607 mm"),
+    (("", '[scatter]\nb_px = 6.0\ntotal = 0.5\nbasis = "fitted"\n'), "scatter: expected one shape: b_px and c, or "
+                                                                     "laws, or table; got b_px"),
+    (("", '[scatter]\ntotal = 0.5\nbasis = "fitted"\n'), "scatter: expected one shape: b_px and c, or laws, or table; "
+                                                         "got none of them"),
+    (("", '[scatter]\ntable = [[2, 1], [1, 1]]\ntotal = 0.5\nbasis = "fitted"\n'), "scatter: table: expected at least "
+                                                                                   "two rows [radius_px, weight]"),
+    (("4.0", "4.0\nsector = { first_angle_deg = 0, opening_deg = 360 }"), "aperture.sector.opening_deg: expected a "
+                                                                          "number of at most 359; got 360"),
+    (("4.0", "4.0\ncorners_mm = [[0, 0], [1, 0], [1, 2]]"), "aperture: expected corners_mm within 2.0 mm of the axis; "
+                                                            "got a corner at 2.23607 mm"),
     (("4.0", "4.0\ncorners_mm = [[0, 0], [1, 1]]"), "aperture: expected corners_mm that enclose an area"),
-    (("4.0", "4.0\nobscuration_diameter_mm = 1.0\ncorners_mm = [[0, 0], [1, 0], [0, 1]]"), "aperture: expected corners_mm alone"),
+    (("4.0", "4.0\nobscuration_diameter_mm = 1.0\ncorners_mm = [[0, 0], [1, 0], [0, 1]]"), "aperture: expected "
+                                                                                           "corners_mm alone"),
     (("", MESH + 'openings = "round"'), "meshes.0.openings: expected one of 'square' or 'hexagonal'; got 'round'"),
     (("4.0", "4.0\nobscuration_diameter_mm = 5.0"), "aperture: expected obscuration_diameter_mm less than diameter_mm"),
     (("", "[match]\nDETECTOR = 174"), "match.DETECTOR: expected a text; got 174"),

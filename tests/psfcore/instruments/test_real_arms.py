@@ -17,7 +17,8 @@ ORDERS = np.arange(1, 6)
 
 
 def cepstrum(image: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The transform of the logarithm of the power spectrum, without its smooth part: echoes of the image become peaks."""
+    """The transform of the logarithm of the power spectrum, without its smooth part: echoes of the image become
+    peaks."""
     size = len(image)
     calm = np.maximum(ndimage.median_filter(image, 5), 1.0)
     root = np.sqrt(np.where(image > calm + 6 * np.sqrt(calm) + 30, calm, np.maximum(image, 1.0)))
@@ -31,8 +32,8 @@ def cepstrum(image: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def test_a_real_image_of_trace_has_the_arms_of_the_file(real: Callable[[str], Path]) -> None:
-    """Of all spacings from 8 to 32 px and all directions, those of the file stand out. Between the two lines of the channel,
-    at 171.1 and 174.5 angstrom, the spacing is 1 % above that of the file."""
+    """Of all spacings from 8 to 32 px and all directions, those of the file stand out. Between the two lines of the
+    channel, at 171.1 and 174.5 angstrom, the spacing is 1 % above that of the file."""
     path = real("other/trace_19980519_222143_171.fits.gz")
     trace = load_instrument("trace_171")
     (mesh,) = trace.meshes

@@ -1,4 +1,5 @@
-"""Telescopes without an instrument file are recognised by the headers of their archives, and the error says what to do."""
+"""Telescopes without an instrument file are recognised by the headers of their archives, and the error says what to
+do."""
 
 from __future__ import annotations
 

@@ -43,7 +43,8 @@ TOO_MANY = {
     "rings": mount(f"rings = [{','.join(65 * ['{ radius_mm = 1, width_mm = 0.01 }'])}]"),
     "polygons": mount(f"polygons = [{','.join(65 * [POLYGON])}]"),
     "corners": mount(f"polygons = [{{ corners_mm = [{','.join(1025 * ['[0, 1]'])}] }}]"),
-    "corners of all polygons": mount(f"polygons = [{','.join(3 * ['{ corners_mm = [' + ','.join(400 * ['[0, 1]']) + '] }'])}]"),
+    "corners of all polygons": mount("polygons = "
+                                     f"[{','.join(3 * ['{ corners_mm = [' + ','.join(400 * ['[0, 1]']) + '] }'])}]"),
     "lines": small(65 * "[[bandpass]]\nwavelength_angstrom = 171.0\nweight = 1.0\n"),
     "gain modes": small("[detector.gain_modes]\n" + "\n".join(f"m{n} = {{ basis = 'assumed' }}" for n in range(65))),
     "characters": small("# " + "x" * MOST_BYTES),

@@ -1,4 +1,5 @@
-"""A report evaluates held-out images, contains the numbers of the fit, and lists what it does not show; and its page."""
+"""A report evaluates held-out images, contains the numbers of the fit, and lists what it does not show; and its
+page."""
 
 from __future__ import annotations
 

@@ -120,7 +120,8 @@ def fitted_at(truth: ScatterTruth, seed: int) -> Psf:
 
 
 def test_between_two_fitted_transits_the_curve_agrees_with_the_truth_within_its_error() -> None:
-    """Two transits with noise are simulated with known scatter and fitted; the truth in the middle is that of a steady change."""
+    """Two transits with noise are simulated with known scatter and fitted; the truth in the middle is that of a steady
+    change."""
     before, after = fitted_at(EARLY, 3), fitted_at(LATE, 3)
     psf = made(before, after)
     truth = cumulative_curve(total_kernel(between(0.5), DIFFRACTION), RADII)

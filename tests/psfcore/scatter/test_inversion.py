@@ -1,4 +1,5 @@
-"""The inversion finds the PSF that a transit was simulated with, and its errors are correct; and the parts of its equations."""
+"""The inversion finds the PSF that a transit was simulated with, and its errors are correct; and the parts of its
+equations."""
 
 from __future__ import annotations
 

@@ -91,7 +91,8 @@ def dark_variances(sky: TrueSky) -> Plane:
 
 @pytest.fixture(scope="module")
 def slopes(plan: Plan, scenes: dict[int, Plane]) -> Plane:
-    """The derivatives of the dark pixels with respect to b, c, total and stretch, from differences of whole simulations."""
+    """The derivatives of the dark pixels with respect to b, c, total and stretch, from differences of whole
+    simulations."""
     rows = []
     for name, step in STEPS.items():
         sides = [

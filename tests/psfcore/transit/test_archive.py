@@ -1,4 +1,5 @@
-"""Archives: listed, packed, and unpacked completely or not at all, whatever they declare; and a transit read in place."""
+"""Archives: listed, packed, and unpacked completely or not at all, whatever they declare; and a transit read in
+place."""
 
 from __future__ import annotations
 
@@ -109,7 +110,8 @@ FROM_SYSTEMS = (
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_files_of_the_transit_are_unpacked_and_no_others(folder: Path, tmp_path: Path, kind: str) -> None:
-    """They are at the top level or in one folder. Hidden files and those of folders beside them are skipped, in any order."""
+    """They are at the top level or in one folder. Hidden files and those of folders beside them are skipped, in any
+    order."""
     (folder / "large.fits").write_bytes(bytes(range(256)) * 5000)  # more than is read at once
     content = {path.name: path.read_bytes() for path in folder.iterdir()}
     for top, order in itertools.product(("", "p1/", "./", "./p1/"), ("alone", "first", "last")):
@@ -382,7 +384,8 @@ def test_entries_of_a_zip_are_counted_and_may_not_share_bytes(
 
 
 def test_a_zip_that_declares_a_wrong_size_is_refused(folder: Path, tmp_path: Path) -> None:
-    """50 KiB that hold 48 MiB: reading stops at the declared size. A size below that of a header is refused when listed."""
+    """50 KiB that hold 48 MiB: reading stops at the declared size. A size below that of a header is refused when
+    listed."""
     content = as_zip(tmp_path / "a.zip", [("x.fits", bytes(48 * MIB))]).read_bytes()
     assert len(content) > 40_000
     for declared in (10_000, 30_000):

@@ -1,8 +1,8 @@
 """Real occultations by Venus: deconvolution with scatter removes light from the dark disc and does not change the ring.
 
 The disc should be dark; its light is scattered light, or noise. No PSF of XRT or of AIA's 1600 A channel is available
-here. An assumed PSF is used: only the softened power law, with several totals. A published deconvolution of the XRT image,
-with its own PSF, is the comparison.
+here. An assumed PSF is used: only the softened power law, with several totals. A published deconvolution of the XRT
+image, with its own PSF, is the comparison.
 """
 
 from __future__ import annotations
@@ -57,8 +57,8 @@ def test_deconvolution_removes_scatter_from_the_disc_of_venus(shared: Path) -> N
 
 
 def test_the_scatter_fitted_to_the_disc_in_xrt_leaves_what_the_fit_calls_no_scatter(shared: Path) -> None:
-    """The light in the disc is a share of the scattered light of its surroundings, and a constant. Deconvolution with this share
-    takes out more than the peer's PSF, which is not fitted to this image."""
+    """The light in the disc is a share of the scattered light of its surroundings, and a constant. Deconvolution with
+    this share takes out more than the peer's PSF, which is not fitted to this image."""
     file, x, y, radius = DISCS["XRT"]
     image = read_observation(shared / "data/real/occultation" / file, LIMITS)
     yy, xx = np.indices(image.pixels.shape)

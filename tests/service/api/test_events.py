@@ -1,5 +1,5 @@
-"""Progress as server-sent events: of one job or bulk run from a running server; and all jobs and bulk runs of an owner in one
-stream, what each look tells, and the stream over HTTP."""
+"""Progress as server-sent events: of one job or bulk run from a running server; and all jobs and bulk runs of an owner
+in one stream, what each look tells, and the stream over HTTP."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import gzip
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from workers.settings import Settings
 
 
 @pytest.fixture
-def decodings(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+def decodings(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The names of the planes that were decoded."""
     names: list[str] = []
     really = of_files.decode_plane
@@ -34,7 +34,7 @@ def decodings(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
         return really(path, name, *given)
 
     monkeypatch.setattr(of_files, "decode_plane", counted)
-    yield names
+    return names
 
 
 def numbers(answer: Response) -> np.ndarray:

@@ -1,5 +1,5 @@
-"""PSFs over HTTP: uploads, versions and their status, validity, contexts, lists, deletion, and products of superseded PSFs.
-PSFs have limits of their own: larger than those of images."""
+"""PSFs over HTTP: uploads, versions and their status, validity, contexts, lists, deletion, and products of superseded
+PSFs. PSFs have limits of their own: larger than those of images."""
 
 from __future__ import annotations
 

@@ -67,7 +67,8 @@ def openapi(*, coverage: bool) -> BaseSchema:
     coverage: whether requests are also derived from each property of a schema, hundreds for a large body.
     """
     schema = schemathesis.openapi.from_dict(json.loads(description()))
-    # A list with far too many members is refused for its size, before they are counted. 412: without the version of tus.
+    # A list with far too many members is refused for its size, before they are counted. 412: without the version of
+    # tus.
     refusals = schema.config.checks.negative_data_rejection
     refusals.expected_statuses = [*refusals.expected_statuses, "412", "413"]
     schema.config.phases.coverage.enabled = coverage
@@ -122,7 +123,8 @@ def seed(client: httpx.Client, folder: Path) -> None:
 
 @schemathesis.serializer("application/fits")
 def as_they_are(_context: Any, value: Any) -> bytes:
-    """Files go as the bytes that they are. What was made up is no FITS: some begin like it, and some become an image."""
+    """Files go as the bytes that they are. What was made up is no FITS: some begin like it, and some become an
+    image."""
     content = (
         value if isinstance(value, bytes) else str(getattr(value, "data", value)).encode("utf-8", "replace")
     )

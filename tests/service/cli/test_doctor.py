@@ -73,9 +73,20 @@ def test_with_nothing_there_it_says_so_and_makes_nothing(tmp_path: Path) -> None
 def test_all_is_well_where_a_worker_is_there(catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
     catalogue.census.announce("host:1", time.time(), software_version())
     assert set(states()) == {
-        "versions", "python", "threads", "kernels", "wall", "storage", "broker", "database", "schema", "changes", "clock",
-        "workers", "stuck jobs",
-    }  # fmt: skip
+        "versions",
+        "python",
+        "threads",
+        "kernels",
+        "wall",
+        "storage",
+        "broker",
+        "database",
+        "schema",
+        "changes",
+        "clock",
+        "workers",
+        "stuck jobs",
+    }
     found = findings()
     for what in found.keys() - {"versions", "python", "threads", "wall"}:
         assert found[what]["state"] == "ok", found[what]

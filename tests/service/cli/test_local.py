@@ -1,4 +1,5 @@
-"""Commands with ``--local``: files are read where they are, built PSFs are kept, and the results are those of a service."""
+"""Commands with ``--local``: files are read where they are, built PSFs are kept, and the results are those of a
+service."""
 
 from __future__ import annotations
 

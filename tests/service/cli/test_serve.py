@@ -1,4 +1,5 @@
-"""``heliopsf serve``: the address for a browser; ``heliopsf demo``: the command that it prints, and the files that it replaces."""
+"""``heliopsf serve``: the address for a browser; ``heliopsf demo``: the command that it prints, and the files that it
+replaces."""
 
 from __future__ import annotations
 

@@ -79,12 +79,12 @@ def job(phase: str) -> dict[str, Any]:
 
 
 @pytest.fixture
-def slept(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[float]]:
+def slept(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """The times that the client slept; nothing waits for them. The clock goes on by as much."""
     times: list[float] = []
     monkeypatch.setattr(http.time, "sleep", times.append)
     monkeypatch.setattr(http.time, "monotonic", lambda: sum(times))
-    yield times
+    return times
 
 
 def client_of(answers: list[Callable[[], httpx.Response]], said: list[str]) -> Client:

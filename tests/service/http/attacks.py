@@ -82,12 +82,17 @@ def long_header(mib: int) -> bytes:
 
 FILES = [
     image("100 MB of cards in gzip", 422, "header-too-long", lambda: gzip.compress(long_header(100), 1)),
-    image("gzip that declares 300 GB", 422, "three-axes", lambda: gzip.compress(primary(8, 10**5, 10**5, 30) + bytes(10**6))),
+    image(
+        "gzip that declares 300 GB",
+        422,
+        "three-axes",
+        lambda: gzip.compress(primary(8, 10**5, 10**5, 30) + bytes(10**6)),
+    ),
     image("a script", 415, "not-fits", lambda: b"#!/bin/sh\nrm -rf /\n" * 500),
     image("more than may be sent", 413, "too-large", lambda: b"SIMPLE  =" + bytes(9 * MIB)),
     image("nothing", 400, "empty-upload", lambda: b""),
     image("a cube", 422, "three-axes", lambda: primary(8, 8, 8, 2) + bytes(2880)),
-]  # fmt: skip
+]
 
 
 # Archives -------------------------------------------------------------------------------------------
@@ -120,9 +125,16 @@ def transit_zip(*more: tuple[str, bytes]) -> bytes:
 
 ARCHIVES = [
     transit("a name that climbs, zip", 422, "archive-climbs", lambda: transit_zip(("../x.fits", b"x"))),
-    transit("a zip of 100 MB of zeros", 413, "archive-too-large", lambda: transit_zip(("b.fits", bytes(100 * MIB)))),
-    transit("a transit.json of lists in lists", 422, "bad-manifest", lambda: zipped(("transit.json", b"[" * DEEP))),
-]  # fmt: skip
+    transit(
+        "a zip of 100 MB of zeros",
+        413,
+        "archive-too-large",
+        lambda: transit_zip(("b.fits", bytes(100 * MIB))),
+    ),
+    transit(
+        "a transit.json of lists in lists", 422, "bad-manifest", lambda: zipped(("transit.json", b"[" * DEEP))
+    ),
+]
 
 
 # Requests -------------------------------------------------------------------------------------------
@@ -146,28 +158,70 @@ REQUESTS = [
     body("a number of 5000 digits", 400, "http-400", b'{"kind":' + b"9" * 5000 + b"}"),
     body("no UTF-8", 400, "http-400", b'{"kind":"\xff\xfe"}'),
     body("half a character", 422, "invalid-request", b'{"kind":"\\ud800","parameters":{}}'),
-    body("NaN", 422, "invalid-request", b'{"kind":"deconvolve","parameters":{"image_id":"%s","saturation_dn":NaN}}' % A.encode()),
+    body(
+        "NaN",
+        422,
+        "invalid-request",
+        b'{"kind":"deconvolve","parameters":{"image_id":"%s","saturation_dn":NaN}}' % A.encode(),
+    ),
     body("20 MB of JSON", 413, "too-large", b'"' + b"x" * 20 * MIB + b'"'),
-    Attack("JSON that says it is text", 422, "invalid-request", content=lambda: b'{"kind":"psf-build"}', headers={"Content-Type": "text/plain"}),
+    Attack(
+        "JSON that says it is text",
+        422,
+        "invalid-request",
+        content=lambda: b'{"kind":"psf-build"}',
+        headers={"Content-Type": "text/plain"},
+    ),
     job("a mask that was not uploaded", 404, "no-such-image", "psf-build", instrument="hri_euv", mask_id=A),
     job("no TOML", 422, "bad-instrument-file", "psf-build", instrument_file="= = ="),
-    job("an instrument that is a path", 422, "unknown-instrument", "psf-build", instrument="../../../etc/passwd"),
+    job(
+        "an instrument that is a path",
+        422,
+        "unknown-instrument",
+        "psf-build",
+        instrument="../../../etc/passwd",
+    ),
     job("an image that is a path", 422, "invalid-request", "deconvolve", image_id="../" * 20 + "etc/passwd"),
     job("an image that was not uploaded", 404, "no-such-image", "deconvolve", image_id=A),
     job("a transit that was not uploaded", 404, "no-such-transit", "psf-fit", transit_id=A),
     job("TOML: lists in lists", 422, "bad-instrument-file", "psf-build", instrument_file="a = " + "[" * DEEP),
-    job("TOML: tables in tables", 422, "bad-instrument-file", "psf-build", instrument_file="a = " + "{b=" * DEEP),
-    job("TOML: a key of 30000 parts", 422, "bad-instrument-file", "psf-build", instrument_file=".".join("a" * 30_000) + " = 1"),
-    job("TOML: a number of 60000 digits", 422, "bad-instrument-file", "psf-build", instrument_file="a = " + "9" * 60_000),
+    job(
+        "TOML: tables in tables",
+        422,
+        "bad-instrument-file",
+        "psf-build",
+        instrument_file="a = " + "{b=" * DEEP,
+    ),
+    job(
+        "TOML: a key of 30000 parts",
+        422,
+        "bad-instrument-file",
+        "psf-build",
+        instrument_file=".".join("a" * 30_000) + " = 1",
+    ),
+    job(
+        "TOML: a number of 60000 digits",
+        422,
+        "bad-instrument-file",
+        "psf-build",
+        instrument_file="a = " + "9" * 60_000,
+    ),
     form("a form without boundary", b"--x\r\n", kind="multipart/form-data"),
     form("a form with a boundary of 5000", b"--x\r\n", kind="multipart/form-data; boundary=" + "x" * 5000),
     form("a form without a file", PART % b"other" + b"1\r\n--x--\r\n"),
-    form("a form of 20000 parts", PART % b"other" + b"1\r\n" + 20_000 * (PART % b"o" + b"1\r\n") + b"--x--\r\n"),
+    form(
+        "a form of 20000 parts", PART % b"other" + b"1\r\n" + 20_000 * (PART % b"o" + b"1\r\n") + b"--x--\r\n"
+    ),
     form("a part with a name of 2 MB", PART % (b"n" * 2 * MIB) + b"1\r\n--x--\r\n"),
     form("a part with 200000 headers", b"--x\r\n" + b"A: b\r\n" * 200_000 + b"\r\n1\r\n--x--\r\n"),
     form("a form that breaks off", PART % b"file" + b"SIMPLE  =", code="upload-ended-early"),
     form("nothing as a form", b""),
-    form("a transit's form that breaks off", PART % b"file" + b"PK\3\4", code="upload-ended-early", to="transits"),
+    form(
+        "a transit's form that breaks off",
+        PART % b"file" + b"PK\3\4",
+        code="upload-ended-early",
+        to="transits",
+    ),
     got("an address of nothing", 404, "http-404", "/v1/nothing"),
     got("an id of 5 letters", 422, "invalid-request", "/v1/transits/short"),
     got("an id that climbs", 404, "http-404", "/v1/images/..%2f..%2fetc%2fpasswd"),
@@ -177,12 +231,26 @@ REQUESTS = [
     got("a phase there is not", 422, "invalid-request", "/v1/jobs?phase=SLEEPING"),
     got("a cursor of nonsense", 422, "bad-cursor", "/v1/transits?cursor=nonsense"),
     got("a cursor of NUL", 422, "bad-cursor", "/v1/jobs?cursor=MS4wIAA="),
-    Attack("a form with a codec of its own", 415, "bad-form", address="/login", headers={"Content-Type": FORM["Content-Type"] + "; charset=undefined"}, content=lambda: PART % b"key" + b"1\r\n--x--\r\n"),
+    Attack(
+        "a form with a codec of its own",
+        415,
+        "bad-form",
+        address="/login",
+        headers={"Content-Type": FORM["Content-Type"] + "; charset=undefined"},
+        content=lambda: PART % b"key" + b"1\r\n--x--\r\n",
+    ),
     got("a name of control letters", 422, "invalid-request", "/v1/psfs?name=%1b%5b31m"),
     got("a host of another's", 421, "host-not-served", "/v1/jobs", Host="evil.example"),
-    Attack("a page of another site", 403, "cross-site", address="/v1/jobs", headers={"Origin": "http://evil.example"}, content=lambda: b"{}"),
+    Attack(
+        "a page of another site",
+        403,
+        "cross-site",
+        address="/v1/jobs",
+        headers={"Origin": "http://evil.example"},
+        content=lambda: b"{}",
+    ),
     Attack("a word that is no method", 405, "http-405", "BREW", "/v1/jobs"),
     got("no key", 401, "no-key", "/v1/jobs", Authorization=""),
     got("a key of nonsense", 401, "bad-key", "/v1/jobs", Authorization="Bearer ' OR 1=1 --"),
     got("a key of a megabyte", 401, "bad-key", "/v1/jobs", Authorization="Bearer hpsf_" + "a" * MIB),
-]  # fmt: skip
+]

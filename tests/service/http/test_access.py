@@ -84,8 +84,8 @@ def test_a_key_that_is_not_good_lets_nobody_in(keys: Keys) -> None:
 
 
 def test_each_route_wants_a_key_of_the_right_scope(shared_service: Keyed) -> None:
-    """Every method and address of the description, asked with ids that name nothing: without a key, with an expired key,
-    and with a key of each single scope that is not the one it needs."""
+    """Every method and address of the description, asked with ids that name nothing: without a key, with an expired
+    key, and with a key of each single scope that is not the one it needs."""
     api = shared_service.api
     expired = shared_service.key("ann", lasts_s=-1)
     keys = {scope: bearer(shared_service.key("ann", scope)) for scope in Scope}

@@ -52,7 +52,8 @@ class Memory:
 
 @contextmanager
 def measured(*, traced: bool = True) -> Iterator[Memory]:
-    """By Python's own count (slow), and by the system's, which also sees what libraries take but not what is used again."""
+    """By Python's own count (slow), and by the system's, which also sees what libraries take but not what is used
+    again."""
     memory = Memory()
     Path("/proc/self/clear_refs").write_text("5")  # the system's peak starts anew
     before_kib = status_kib("VmRSS")
@@ -120,7 +121,8 @@ def test_a_bad_file_is_refused_wherever_and_however_it_is_sent(service: Keyed) -
 def test_tiles_that_lie_pass_the_header_and_end_the_job_within_bounds(
     service: Keyed, data: Path, psf_file: Path
 ) -> None:
-    """A few kilobytes that unfold to 128 MiB: the header says 64 x 64 px, so that only who reads the pixels can tell."""
+    """A few kilobytes that unfold to 128 MiB: the header says 64 x 64 px, so that only who reads the pixels can
+    tell."""
     ann = service.client("liar")
     answer = ann.post("/v1/images", content=lying_tiles(gzip.compress(bytes(128 * MIB), 6)))
     assert answer.status_code == 201, answer.text

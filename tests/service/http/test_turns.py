@@ -24,8 +24,8 @@ PIECES = 5
 class Server:
     """An application behind the guard. A key is the name of its owner, and a number.
 
-    inside: how many requests of each owner are not yet admitted. go: lets them be admitted. rounds: in which round of the event
-    loop the pieces of the bodies of each owner arrive.
+    inside: how many requests of each owner are not yet admitted. go: lets them be admitted. rounds: in which round of
+    the event loop the pieces of the bodies of each owner arrive.
     """
 
     def __init__(self, settings: Settings) -> None:

@@ -6,7 +6,6 @@ import gzip
 import hashlib
 import re
 import tomllib
-from collections.abc import Iterator
 from importlib.resources import files
 from pathlib import Path
 
@@ -104,7 +103,7 @@ def test_the_scripts_and_styles_of_a_page_are_light() -> None:
 
 
 @pytest.fixture
-def filled(api: TestClient, settings: Settings, psf_file: Path, tmp_path: Path) -> Iterator[TestClient]:
+def filled(api: TestClient, settings: Settings, psf_file: Path, tmp_path: Path) -> TestClient:
     """A service with a list of jobs that fills a page, a product, and a bulk run with done and failed images."""
     psf_id = upload(api, psf_file, "/v1/psfs")
     ids = []
@@ -126,7 +125,7 @@ def filled(api: TestClient, settings: Settings, psf_file: Path, tmp_path: Path) 
         api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": asked | {"method": method}})
     catalogue.close()
     api.headers["Accept"] = "text/html"
-    yield api
+    return api
 
 
 def links(page: str) -> set[str]:

@@ -227,10 +227,26 @@ def test_a_login_leads_to_the_page_that_was_asked_for_and_nowhere_else(service: 
     for page in ("/", "/jobs", "/jobs?phase=ERROR&a=//b", "/psfs/a/vs/b", "/login-help"):
         assert local_address(page) == page
     for sent in (
-        "//evil.example", "///evil.example", "/\\evil.example", "\\/evil.example", "https://evil.example", "http:evil.example",
-        "javascript:alert(1)", "evil.example", "", " /jobs", "/\t/evil.example", "/\n/evil.example", "/jobs\r\nSet-Cookie: a=b",
-        "/jobs\x00", "/\u2028/evil.example", "/login", "/login?next=/jobs", "/logout", "/" + "a" * LONGEST_ADDRESS,
-    ):  # fmt: skip
+        "//evil.example",
+        "///evil.example",
+        "/\\evil.example",
+        "\\/evil.example",
+        "https://evil.example",
+        "http:evil.example",
+        "javascript:alert(1)",
+        "evil.example",
+        "",
+        " /jobs",
+        "/\t/evil.example",
+        "/\n/evil.example",
+        "/jobs\r\nSet-Cookie: a=b",
+        "/jobs\x00",
+        "/\u2028/evil.example",
+        "/login",
+        "/login?next=/jobs",
+        "/logout",
+        "/" + "a" * LONGEST_ADDRESS,
+    ):
         assert local_address(sent) == "/", sent
     data = {"key": service.key("ann"), "next": "//evil.example"}
     assert browser(service).post("/login", data=data, headers=OWN_PAGE).headers["location"] == "/"

@@ -332,7 +332,8 @@ def test_a_pixel_keeps_its_place_on_the_sky(shared_api: TestClient, product: str
 
 
 def test_a_region_on_the_sky_is_inside_its_cutout(shared_api: TestClient, product: str) -> None:
-    """Every pixel whose centre is in a rotated box on the sky is in the cut-out: compared with all pixels of the image."""
+    """Every pixel whose centre is in a rotated box on the sky is in the cut-out: compared with all pixels of the
+    image."""
     api = shared_api
     header = fits.getheader(io.BytesIO(api.get(f"/v1/products/{product}/file").content))
     y, x = np.indices(SHAPE)

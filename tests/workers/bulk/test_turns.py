@@ -1,4 +1,5 @@
-"""Turns of bulk runs: reading, computing, writing and listing overlap; interruptions, errors, images of lost workers."""
+"""Turns of bulk runs: reading, computing, writing and listing overlap; interruptions, errors, images of lost
+workers."""
 
 from __future__ import annotations
 

@@ -107,9 +107,17 @@ ANY = "0" * 32
 def job(number: int, owner: str = "ann", **values: object) -> dict[str, object]:
     key = f"{number:064x}"
     return {
-        "id": f"{number:032x}", "owner": owner, "kind": "psf-build", "parameters": {}, "request_key": key, "work_key": key,
-        "phase": "COMPLETED", "created_at": float(number), "changed_at": float(number), **values,
-    }  # fmt: skip
+        "id": f"{number:032x}",
+        "owner": owner,
+        "kind": "psf-build",
+        "parameters": {},
+        "request_key": key,
+        "work_key": key,
+        "phase": "COMPLETED",
+        "created_at": float(number),
+        "changed_at": float(number),
+        **values,
+    }
 
 
 def add_jobs(catalogue: Catalogue, *jobs: dict[str, object]) -> None:

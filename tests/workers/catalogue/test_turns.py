@@ -1,4 +1,5 @@
-"""Whose waiting job comes next, and which place it has: owners take turns, and no job is lost or left without a message."""
+"""Whose waiting job comes next, and which place it has: owners take turns, and no job is lost or left without a
+message."""
 
 from __future__ import annotations
 

@@ -24,9 +24,9 @@ def test_a_pending_job_waits_until_it_is_started(catalogue: Catalogue) -> None:
     job = drafted(catalogue)
 
     def fail(given: dict[str, Any]) -> dict[str, Any]:
-        raise ValueError(given)
+        raise ValueError("no", given)
 
-    with pytest.raises(ValueError):
+    with pytest.raises(ValueError, match="no"):
         catalogue.uws.amend(job.id, fail)
     row = job_row(catalogue, job.id)
     assert row.parameters == job.parameters, "a change that fails changes nothing"

@@ -55,8 +55,12 @@ def test_everything_that_changes_the_result_changes_the_identity(monkeypatch: py
     recipe = {"instrument": "hri_euv"}
     assert base == identity(psf_recipe=recipe), "how a PSF would be made is in its id"
     between = {
-        "before_psf_id": A, "before_time": "2021-01-01", "after_psf_id": T, "after_time": "2022-01-01", "time": "2021-06-01",
-    }  # fmt: skip
+        "before_psf_id": A,
+        "before_time": "2021-01-01",
+        "after_psf_id": T,
+        "after_time": "2022-01-01",
+        "time": "2021-06-01",
+    }
     assert base == identity(psf_interpolation=between), "how a PSF would be interpolated is in its id"
     assert base == identity(again=True), "this only allows the deconvolution"
     others = {
@@ -77,8 +81,12 @@ def test_everything_that_changes_the_result_changes_the_identity(monkeypatch: py
 
 def test_an_interpolated_psf_is_identified_by_its_ends_and_times(monkeypatch: pytest.MonkeyPatch) -> None:
     known = {
-        "before_psf_id": A, "before_time": "2021-01-01", "after_psf_id": B, "after_time": "2022-01-01", "time": "2021-06-01",
-    }  # fmt: skip
+        "before_psf_id": A,
+        "before_time": "2021-01-01",
+        "after_psf_id": B,
+        "after_time": "2022-01-01",
+        "time": "2021-06-01",
+    }
     changes = (
         {},
         {"before_psf_id": T},
@@ -123,9 +131,13 @@ def _masked() -> str:
 
 
 OPTIONS: dict[str, Any] = {
-    "picked_for": "hri_euv", "context_id": "ctx", "noise": NOISE, "saturation_dn": 4000.0, "error_draws": 8,
+    "picked_for": "hri_euv",
+    "context_id": "ctx",
+    "noise": NOISE,
+    "saturation_dn": 4000.0,
+    "error_draws": 8,
     "method": {"name": "linear", "steps": 7, "edges": "zero"},
-}  # fmt: skip
+}
 FIT: dict[str, Any] = {"noise": NOISE, "seed": 3, "shape": "knee", "as_published": True, "saturation_dn": 1.5}
 # The first 16 digits of ids. The id of a result that exists must not change.
 FROZEN: list[tuple[Callable[[], str], str]] = [

@@ -222,7 +222,8 @@ def delete(store: Store, catalogue: Catalogue, digest: str, owner: str) -> None:
 
 
 def pair(number: int, store: Store, catalogue: Catalogue) -> str | None:
-    """An owner deletes a file, and another uploads it; returns the file if this upload was accepted, and not deleted later."""
+    """An owner deletes a file, and another uploads it; returns the file if this upload was accepted, and not deleted
+    later."""
     content = b"%d" % number
     digest = hashlib.sha256(content).hexdigest()
     while not upload(store, catalogue, content, "a"):
@@ -258,8 +259,8 @@ def check_pairs(
     monkeypatch: pytest.MonkeyPatch,
     folder: Path,
 ) -> None:
-    """One of 20 answers of the store is wrong. Who reads an accepted file finds it, or is told to try again later; at the
-    end all accepted files are there, and no others.
+    """One of 20 answers of the store is wrong. Who reads an accepted file finds it, or is told to try again later; at
+    the end all accepted files are there, and no others.
     """
     # Longer than an upload takes between its file and its row: a call waits for 2 s.
     monkeypatch.setattr(garbage, "SETTLED_AFTER_S", 15.0)

@@ -1,4 +1,5 @@
-"""The data folder is closed to other users, output folders follow the operator's umask, and links lead out of no allowed folder."""
+"""The data folder is closed to other users, output folders follow the operator's umask, and links lead out of no
+allowed folder."""
 
 from __future__ import annotations
 

@@ -132,7 +132,8 @@ def change(catalogue: Catalogue, status: PsfStatus, reason: str = "", **more: An
 
 @pytest.fixture
 def catalogue(local: InProcess, psf_file: Path, tmp_path: Path) -> Catalogue:
-    """The catalogue of the local service holds the PSF that is built for HRI_EUV, with other pixels, as a certified PSF."""
+    """The catalogue of the local service holds the PSF that is built for HRI_EUV, with other pixels, as a certified
+    PSF."""
     write_image(tmp_path / "i.fits", **HRI, **AT)
     found = local.catalogue
     uploaded = found.get(PsfRow, local.upload_psf(psf_file)["id"], OWNER)

@@ -159,12 +159,20 @@ def completed(catalogue: Catalogue, count: int, took_s: float, start_s: float = 
     """Add completed deconvolutions that were expected to take ``start_s`` and took so long."""
     rows = [
         JobRow(
-            id=uuid.uuid4().hex, owner=OWNER, kind="deconvolve", parameters={}, request_key=uuid.uuid4().hex, work_key="k",
-            phase=Phase.COMPLETED, created_at=0.0, started_at=100.0, ended_at=100.0 + took_s,
+            id=uuid.uuid4().hex,
+            owner=OWNER,
+            kind="deconvolve",
+            parameters={},
+            request_key=uuid.uuid4().hex,
+            work_key="k",
+            phase=Phase.COMPLETED,
+            created_at=0.0,
+            started_at=100.0,
+            ended_at=100.0 + took_s,
             estimate={"memory_mib": 1, "seconds": start_s, "start_s": start_s},
         )
         for _ in range(count)
-    ]  # fmt: skip
+    ]
     add(catalogue, *rows)
 
 

@@ -1,5 +1,5 @@
-"""The PSF of an image: the variant of its channel, the two PSFs between which its PSF is interpolated, and the error, for people
-and for programs, if its PSF is not known."""
+"""The PSF of an image: the variant of its channel, the two PSFs between which its PSF is interpolated, and the error,
+for people and for programs, if its PSF is not known."""
 
 from __future__ import annotations
 

@@ -36,7 +36,8 @@ def clock_off(by_s: float) -> Iterator[None]:
 
 
 def move_times(catalogue: Catalogue, by_s: float) -> None:
-    """Move all written times: back, as if so much time had passed; or ahead, as if the database's clock were set back."""
+    """Move all written times: back, as if so much time had passed; or ahead, as if the database's clock were set
+    back."""
     change(catalogue, *(update(one.class_).values({one.key: one + by_s}) for one in TIMES))
 
 

@@ -97,7 +97,8 @@ def folds(
 def report(
     service: InProcess, transit: Path, inversions: list[int], tmp_path_factory: pytest.TempPathFactory
 ) -> dict[str, Any]:
-    """One report of a fit without the slow dark offsets, all of its files, and what the comparison of shapes was given."""
+    """One report of a fit without the slow dark offsets, all of its files, and what the comparison of shapes was
+    given."""
     out, given = tmp_path_factory.mktemp("report"), []
 
     def compare(solution: Any, *, seed: int, progress: object) -> Any:
@@ -148,7 +149,8 @@ def test_the_product_says_what_it_was_made_of(fitted: dict[str, Any]) -> None:
         step / steps for stage, step, steps in fitted["steps"] if stage not in ("reading", "building the PSF")
     ]
     assert len(shares) > 3 and min(shares) >= 0 and max(shares) <= 1
-    # The test of the fit shows that its progress increases. On a busy machine a step of the job comes after it now and then.
+    # The test of the fit shows that its progress increases. On a busy machine a step of the job comes after it now and
+    # then.
 
 
 def test_an_identical_request_gets_the_existing_result(

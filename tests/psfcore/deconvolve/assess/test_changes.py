@@ -148,7 +148,8 @@ def test_worse_deconvolutions_rank_above_better_ones(seen: Image, psf: Psf, resu
 
 
 def test_the_suspected_pixels_are_those_of_a_slow_search() -> None:
-    """Holes, overshoots and new extremes by their definitions, with the filters of SciPy, on more than a block of rows."""
+    """Holes, overshoots and new extremes by their definitions, with the filters of SciPy, on more than a block of
+    rows."""
     rng = np.random.default_rng(1)
     before = rng.gamma(4.0, 100.0, (150, 70)).astype(np.float32)
     after = (before * rng.gamma(3.0, 0.4, before.shape)).astype(np.float32)

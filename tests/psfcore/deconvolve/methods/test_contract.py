@@ -1,4 +1,5 @@
-"""What a method needs, beside its equation: each fault is told as a sentence that says what to add (CONTRIBUTING.md)."""
+"""What a method needs, beside its equation: each fault is told as a sentence that says what to add
+(CONTRIBUTING.md)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Every method: its equation in double precision, and what all have in common: masks, scales, edges, stopping, threads."""
+"""Every method: its equation in double precision, and what all have in common: masks, scales, edges, stopping,
+threads."""
 
 from __future__ import annotations
 
@@ -171,7 +172,8 @@ def test_a_psf_with_which_additive_steps_diverge_is_refused() -> None:
 
 
 def test_bad_pixels_have_no_influence(seen: Plane, psf: Psf) -> None:
-    """NaN stays in place and does not spread. The result is the same, pixel by pixel, for any value of a masked pixel."""
+    """NaN stays in place and does not spread. The result is the same, pixel by pixel, for any value of a masked
+    pixel."""
     holed = seen.copy()
     holed[80:83, 70:72] = np.nan
     holed[0, :5] = -np.inf
@@ -277,7 +279,8 @@ def test_discrepancy_stops_near_the_noise(psf: Psf, seen: Plane) -> None:
 
 
 def test_twenty_steps_fit_noise_and_discrepancy_and_total_variation_do_not(psf: Psf) -> None:
-    """The error of total variation is smaller than with any number of plain steps, and further steps do not increase it."""
+    """The error of total variation is smaller than with any number of plain steps, and further steps do not increase
+    it."""
     scene = solar_scene((384, 384), 1)
     observed = observe(scene, psf, exposure_s=1.4, photon_gain_dn=6.0, read_noise_dn=2.0, seed=1)
     image = dataclasses.replace(make_image(observed), exposure_s=1.4)

@@ -60,7 +60,8 @@ def test_a_sample_excludes_its_block_and_guard_and_an_empty_one_is_refused() -> 
 
 
 def test_an_exact_fold_agrees_with_a_fit_from_the_start() -> None:
-    """Started at the shared step, it converges to the result of `invert` with the same counts, and keeps the solution."""
+    """Started at the shared step, it converges to the result of `invert` with the same counts, and keeps the
+    solution."""
     draw = bootstrap_samples(IMAGES, runs=1)[1]
     scenes, places = [scene.copy() for scene in solved().sky.scenes], list(solved().sky.found)
     slow = invert(observed(sky()).transit, counts=draw.counts)

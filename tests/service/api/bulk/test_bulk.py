@@ -308,10 +308,22 @@ INVALID: list[tuple[dict[str, Any], int, str]] = [
     ({"files": [{"glob": "{root}/loop/*.fits"}], "psf_id": "{psf}"}, 422, "bad-path"),
     ({"files": [{"glob": "*.fits"}], "psf_id": "{psf}"}, 422, "bad-path"),
     ({"files": [{"glob": "{root}/*", "where": {"x": 1}}], "psf_id": "{psf}"}, 422, "invalid-request"),
-    ({"files": [{"glob": "{root}/*"}], "psf_id": "{psf}", "output": {"folder": "{root}"}}, 422, "path-not-allowed"),
-    ({"files": [{"glob": "{root}/*"}], "psf_id": "{psf}", "output": {"folder": "{out}", "layout": "{telescope}.fits"}}, 422, "invalid-request"),
+    (
+        {"files": [{"glob": "{root}/*"}], "psf_id": "{psf}", "output": {"folder": "{root}"}},
+        422,
+        "path-not-allowed",
+    ),
+    (
+        {
+            "files": [{"glob": "{root}/*"}],
+            "psf_id": "{psf}",
+            "output": {"folder": "{out}", "layout": "{telescope}.fits"},
+        },
+        422,
+        "invalid-request",
+    ),
     ({"images": ["a" * 64] * 100_001, "psf_id": "{psf}"}, 422, "invalid-request"),
-]  # fmt: skip
+]
 
 
 def test_invalid_requests_are_refused(api: TestClient, archive: Path, out: Path, psf_id: str) -> None:

@@ -112,7 +112,17 @@ def run(*words: str) -> str:
 def test_the_cache_is_listed_and_cleared(tmp_path: Path) -> None:
     assert run("cache", "list").startswith("0 PSFs, 0.0 of 2048 MiB")
     (tmp_path / "small.toml").write_text(SMALL_INSTRUMENT)
-    run("psf", "build", "--instrument", str(tmp_path / "small.toml"), "--size", "64", "-o", str(tmp_path / "a.fits"), "--local")  # fmt: skip
+    run(
+        "psf",
+        "build",
+        "--instrument",
+        str(tmp_path / "small.toml"),
+        "--size",
+        "64",
+        "-o",
+        str(tmp_path / "a.fits"),
+        "--local",
+    )
     listed = run("cache", "list").splitlines()
     assert len(listed) == 2 and listed[0].endswith("your instrument file, 64 px")
     assert listed[1].startswith("1 PSFs")

@@ -1,5 +1,5 @@
-"""``heliopsf psf list|upload|certify|deprecate|best|lineage|rerun`` and ``heliopsf context``, and the client behind them.
-``heliopsf psf series`` and ``psf interpolate``, and the commands that name an interpolated PSF."""
+"""``heliopsf psf list|upload|certify|deprecate|best|lineage|rerun`` and ``heliopsf context``, and the client behind
+them. ``heliopsf psf series`` and ``psf interpolate``, and the commands that name an interpolated PSF."""
 
 from __future__ import annotations
 

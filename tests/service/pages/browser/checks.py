@@ -30,7 +30,8 @@ VIEWS = {
 
 
 def good(page: Page) -> None:
-    """No violation of accessibility rules and no horizontal scrolling: in light and dark, on a phone, and at a zoom of 200 %."""
+    """No violation of accessibility rules and no horizontal scrolling: in light and dark, on a phone, and at a zoom of
+    200 %."""
     before = page.viewport_size
     assert before is not None
     for name, view in VIEWS.items():

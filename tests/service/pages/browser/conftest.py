@@ -1,5 +1,5 @@
-"""A real browser, and the service that it visits. Each test fails on a violation of the policy, on a request to another host,
-and on an error in the console."""
+"""A real browser, and the service that it visits. Each test fails on a violation of the policy, on a request to another
+host, and on an error in the console."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ from tests.whole.stack import Stack, wait_for
 from workers.catalogue.tables import DEFAULT_OWNER
 
 collect_ignore_glob = [] if chromium() else ["test_*.py"]  # tests/chromium.py says so in one line
-# A name that the service does not serve, and one that browsers do not take for this machine, so HTTP is not secure there.
+# A name that the service does not serve, and one that browsers do not take for this machine, so HTTP is not secure
+# there.
 UNSERVED, PLAIN_NAME = "unserved.test", "sun.test"
 # WebGL2 in software, as on machines without a graphics card.
 SOFTWARE_GL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")

@@ -1,4 +1,5 @@
-"""Every page with real contents and long names: in light and dark, on a phone, at a zoom of 200 %, in windows of any width.
+"""Every page with real contents and long names: in light and dark, on a phone, at a zoom of 200 %, in windows of any
+width.
 
 The pages of the login and of keys are visited by ``test_login``.
 """

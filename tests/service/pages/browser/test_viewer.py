@@ -79,7 +79,8 @@ def canvas(page: Page) -> NDArray[np.uint8]:
 
 
 def canvas_once(page: Page, drawn_as_wanted: Callable[[NDArray[np.uint8]], bool]) -> NDArray[np.uint8]:
-    """The canvas when it shows what is wanted; after ten seconds, what it shows then. A tile is decoded and drawn after it arrived."""
+    """The canvas when it shows what is wanted; after ten seconds, what it shows then. A tile is decoded and drawn after
+    it arrived."""
     for _ in range(100):
         seen = canvas(page)
         if drawn_as_wanted(seen):
@@ -115,8 +116,8 @@ def enlarged(
 
 
 def reduced(plane: NDArray[np.float32], shape: tuple[int, ...]) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-    """What a canvas [y, x] shows of a plane when all of it fits: means of the finite pixels whose centres lie in a pixel of the
-    canvas. The sums are of single precision, in the order of the rows, as the card adds them."""
+    """What a canvas [y, x] shows of a plane when all of it fits: means of the finite pixels whose centres lie in a
+    pixel of the canvas. The sums are of single precision, in the order of the rows, as the card adds them."""
     zoom = min(shape[0] / plane.shape[0], shape[1] / plane.shape[1])
     edges = [
         np.clip(np.ceil(size / 2 + (np.arange(n + 1) - n / 2) / zoom - 0.5).astype(int), 0, size)
@@ -239,7 +240,8 @@ def script(page: Page, name: str, expression: str) -> Any:
     source = page.locator('script[src*="viewer.js"]').get_attribute("src")
     assert source is not None
     return page.evaluate(
-        f"async () => {{ const module = await import({json.dumps(source.replace('viewer.js', name))}); return {expression}; }}"
+        f"async () => {{ const module = await import({json.dumps(source.replace('viewer.js', name))}); return "
+        f"{expression}; }}"
     )
 
 

@@ -1,4 +1,5 @@
-"""Jobs that wait, and a service that is lost during an upload: on a service of this file's own, for which nobody works."""
+"""Jobs that wait, and a service that is lost during an upload: on a service of this file's own, for which nobody
+works."""
 
 from __future__ import annotations
 

@@ -173,9 +173,11 @@ def test_the_keyboard_alone_leads_from_a_file_to_a_blinked_product(
 ) -> None:
     page.goto("/")
     tab_to(page, page.locator("#file"))
-    # The system's own dialog is no part of the page. A browser that showed pages for long does not always report it to tests.
+    # The system's own dialog is no part of the page. A browser that showed pages for long does not always report it to
+    # tests.
     page.locator("#file").evaluate(
-        "(input) => input.addEventListener('click', (event) => { event.preventDefault(); window.asked = event.isTrusted; })"
+        "(input) => input.addEventListener('click', (event) => { event.preventDefault(); window.asked = "
+        "event.isTrusted; })"
     )
     page.keyboard.press("Space")
     assert page.evaluate("window.asked"), "the key opens the dialog"
