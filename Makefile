@@ -29,7 +29,7 @@ demo: $(RUN)
 
 # Without the rules of the house, which make lint checks.
 test: $(DEV) $(if $(CI),browser)
-	$(BIN)/python -m pytest -m "not slow" -n 3 --dist loadfile --ignore tests/house tests
+	$(BIN)/python -m pytest -m "not slow" -n 4 --dist loadfile --ignore tests/house tests
 
 # The tests of one room in one process, for example: make test-fast FILES=tests/psfcore/gap/library
 test-fast: $(DEV)
@@ -53,7 +53,7 @@ test-newest:
 # The share of branches that the fast tests run, by room, into the table of CONTRIBUTING.md.
 coverage: $(DEV)
 	$(BIN)/python -m coverage erase
-	$(BIN)/python -m pytest -m "not slow" -n 3 --dist loadfile --ignore tests/house --cov --cov-report= tests
+	$(BIN)/python -m pytest -m "not slow" -n 4 --dist loadfile --ignore tests/house --cov --cov-report= tests
 	$(BIN)/python -m tests.house.coverage CONTRIBUTING.md
 
 # Each figure beside its goal and the stored one; needs 20 minutes and no other program on the machine.

@@ -51,7 +51,7 @@ from numpy.typing import NDArray
 
 from psfcore.compiled import compiled
 from psfcore.convolution.convolver import transform_axis
-from psfcore.diffraction.mirrored import MirroredTransforms, Place, can_transform, passes
+from psfcore.diffraction.mirrored import MirroredTransforms, SampleOffset, can_transform, passes
 from psfcore.diffraction.pupil import MaskGrid, Pupil
 from psfcore.instruments.model import MM_PER_ANGSTROM, MM_PER_UM
 
@@ -198,7 +198,7 @@ class _Transforms:
         self.field = np.empty((period, size), dtype=np.complex64)
         self.total = np.zeros((size, size))
 
-    def summed(self, places: Sequence[Place], progress: Progress) -> NDArray[np.float64]:
+    def summed(self, places: Sequence[SampleOffset], progress: Progress) -> NDArray[np.float64]:
         """The sum of |E|^2 over the places, each multiplied by its weight. progress(done, of)."""
         done = 0
         for here, of_pass in passes(places, len(self.spectra)):
@@ -253,7 +253,7 @@ class _Transforms:
         list(self.pool.map(lambda block: _add_intensity(field[block], self.total[block], weight), blocks))
 
 
-def _places(samples: int, symmetry: str) -> list[Place]:
+def _places(samples: int, symmetry: str) -> list[SampleOffset]:
     """The positions (s, t) that must be computed, in ascending order, with their weights.
 
     The symmetry of the mask decides whether t takes all values, the first half, or the values up to s. In the last case
@@ -263,7 +263,7 @@ def _places(samples: int, symmetry: str) -> list[Place]:
     half, transpose = samples // 2, symmetry == MIRROR_AND_TRANSPOSE
     offsets = [(place + 0.5) / samples - 0.5 for place in range(samples)]  # o_s of Eq. (2)
     return [
-        Place(offsets[s], offsets[t], 0.5 if transpose and s == t else 1.0)
+        SampleOffset(offsets[s], offsets[t], 0.5 if transpose and s == t else 1.0)
         for s in range(half)
         for t in range({NO_SYMMETRY: samples, MIRROR: half, MIRROR_AND_TRANSPOSE: s + 1}[symmetry])
     ]

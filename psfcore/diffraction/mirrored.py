@@ -51,7 +51,7 @@ Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
-class Place:
+class SampleOffset:
     """A position (s, t) of the samples within a pixel: their offsets (px), and how often the intensity counts."""
 
     offset_x: float
@@ -59,7 +59,7 @@ class Place:
     weight: float
 
 
-def passes(places: Sequence[Place], together: int) -> Iterator[tuple[list[float], list[Place]]]:
+def passes(places: Sequence[SampleOffset], together: int) -> Iterator[tuple[list[float], list[SampleOffset]]]:
     """Divide places into passes over the mask: the offsets in x of each pass, at most `together`, and its places."""
     offsets = sorted({place.offset_x for place in places})
     for first in range(0, len(offsets), together):
@@ -95,7 +95,7 @@ class MirroredTransforms:
             shapes = (BLOCK, mask.cells), (self.cells, 2, LANES), period * BLOCK, (BLOCK, LANES)
             self._buffers.put(_Buffers(*(np.empty(shape, np.float32) for shape in shapes)))
 
-    def summed(self, places: Sequence[Place], progress: Progress) -> NDArray[np.float64]:
+    def summed(self, places: Sequence[SampleOffset], progress: Progress) -> NDArray[np.float64]:
         """The sum of |E|^2 over the places, each multiplied by its weight; shape (size, size). progress(done, of)."""
         offsets = len({place.offset_x for place in places})
         bytes_each = self.column_blocks * self.row_blocks * BLOCK**2 * 4
@@ -127,7 +127,7 @@ class MirroredTransforms:
 
         self._run(work, self.row_blocks)
 
-    def _along_y(self, field: Single, place: Place, total: NDArray[np.float64]) -> None:
+    def _along_y(self, field: Single, place: SampleOffset, total: NDArray[np.float64]) -> None:
         """Add the intensities of one place to `total`, from the field after the transform along x."""
         turn = self._factors(place.offset_y)
 

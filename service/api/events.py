@@ -32,7 +32,7 @@ from service.api.bulk import find as find_bulk
 from service.api.jobs import JobId
 from service.api.jobs import find as find_job
 from service.http.callers import Caller, Reading, still_let_in
-from service.http.lookout import Follower, Key, Kind, Lookout, OwnerFollower, version
+from service.http.lookout import Follower, Key, Lookout, OwnerFollower, StreamKind, version
 from service.http.problems import RESPONSES
 from service.http.state import Shared
 from service.views import JobView
@@ -112,9 +112,9 @@ def _stream(request: Request, state: Shared, caller: Caller, follower: Follower)
     state.streams.open(caller.account)
     ends_at = time.monotonic() + state.settings.stream_s
     catalogue = state.catalogue
-    kinds: list[Kind[Any]] = [
-        Kind("job", catalogue.job_changes, JobView.of),
-        Kind("bulk", catalogue.bulk_changes, partial(BulkView.of, state=state)),
+    kinds: list[StreamKind[Any]] = [
+        StreamKind("job", catalogue.job_changes, JobView.of),
+        StreamKind("bulk", catalogue.bulk_changes, partial(BulkView.of, state=state)),
     ]
     lookout = Lookout(caller.owner, kinds, catalogue.clock, partial(still_let_in, state))
     lookout = state.lookouts.setdefault(caller.owner, lookout)

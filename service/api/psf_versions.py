@@ -38,7 +38,7 @@ Channel = Annotated[
         pattern=r"^(-|[a-z0-9][a-z0-9_.-]{0,39})$", description="such as `174`; `-`: the channel is unknown"
     ),
 ]
-Kind = Annotated[str, Path(pattern=WORD, description="such as `total`")]
+PsfKind = Annotated[str, Path(pattern=WORD, description="such as `total`")]
 IdOrName = Annotated[
     str, Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$", description="id or name of the context")
 ]
@@ -153,7 +153,7 @@ def list_series(caller: Reading, state: Shared) -> Page[SeriesSummary]:
 
 @series.get("/{instrument}/{channel}/{kind}", summary="One series")
 def get_series(
-    instrument: Instrument, channel: Channel, kind: Kind, caller: Reading, state: Shared
+    instrument: Instrument, channel: Channel, kind: PsfKind, caller: Reading, state: Shared
 ) -> SeriesView:
     """Whether the PSFs of a series may be interpolated, and who changed this, when and why."""
     return _series(state, caller, f"{instrument}/{channel}/{kind}")
@@ -163,7 +163,7 @@ def get_series(
 def change_series(
     instrument: Instrument,
     channel: Channel,
-    kind: Kind,
+    kind: PsfKind,
     body: SeriesChange,
     caller: Certifying,
     state: Shared,

@@ -39,7 +39,7 @@ ALGORITHMS: dict[str, Callable[[], Any]] = {
     "md5": hashlib.md5,
 }
 PART = "application/offset+octet-stream"
-KINDS: dict[str, files.Kind[Any]] = {"transit": files.TRANSIT, "image": files.IMAGE}
+KINDS: dict[str, files.UploadKind[Any]] = {"transit": files.TRANSIT, "image": files.IMAGE}
 
 
 def _header(name: str, description: str | None = None, *, required: bool = True) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from service.cli.options import (
     OUTPUT_FOLDER,
     OUTPUT_PLACE,
     OVERWRITE,
-    Place,
+    OutputPath,
     counted,
     fits_files,
     is_local,
@@ -73,7 +73,7 @@ SHOWN = 20
 @OVERWRITE
 def deconvolve(
     images: tuple[Path, ...],
-    output: Place,
+    output: OutputPath,
     psf: str | None,
     plot: Path | None,
     changes: Path | None,

@@ -23,7 +23,7 @@ from service.cli.options import (
     OUTPUT,
     OUTPUT_PLACE,
     PLOT,
-    Place,
+    OutputPath,
     write_json,
     writes_files,
 )
@@ -162,7 +162,7 @@ def list_products(service: Client, image_id: str | None, psf_id: str | None, mos
 def get(
     service: Client,
     identity: str,
-    output: Place | None,
+    output: OutputPath | None,
     plot: Path | None,
     changes: Path | None,
     overwrite: bool,

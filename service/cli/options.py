@@ -208,14 +208,14 @@ class OutputPlace(OutputFile):
 
     def convert(  # type: ignore[override]
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> Place:
+    ) -> OutputPath:
         """The path, and whether it is a folder: a folder of this name exists, or the text ends in a slash."""
         path = super().convert(value, param, ctx)
-        return Place(Path(path), is_folder=str(value).endswith(("/", os.sep)) or Path(path).is_dir())
+        return OutputPath(Path(path), is_folder=str(value).endswith(("/", os.sep)) or Path(path).is_dir())
 
 
 @dataclass(frozen=True)
-class Place:
+class OutputPath:
     """Where to write a result."""
 
     path: Path
@@ -312,10 +312,10 @@ def _check_files(parameters: Sequence[click.Parameter], given: dict[str, Any]) -
     inputs: list[Path] = []
     for parameter in parameters:
         value = given.get(parameter.name or "")
-        if isinstance(value, Place) and value.is_folder:
+        if isinstance(value, OutputPath) and value.is_folder:
             check_output_folder(value.path)
         elif isinstance(parameter.type, OutputFile):
-            outputs.append(value.path if isinstance(value, Place) else value)
+            outputs.append(value.path if isinstance(value, OutputPath) else value)
         elif not isinstance(parameter.type, OutputFolder):
             values = value if isinstance(value, tuple) else (value,)
             inputs += [one for one in values if isinstance(one, Path)]

@@ -163,7 +163,7 @@ OPENAPI_TRANSIT_BODY = _body("archive of the transit (.zip, .tar or .tar.gz)", "
 
 
 @dataclass(frozen=True)
-class Kind(Generic[Row]):
+class UploadKind(Generic[Row]):
     """A kind of file that can be uploaded.
 
     may_start: whether a file of this kind can start with these bytes; True as second argument: there are no further
@@ -247,7 +247,7 @@ _FITS_START = (
     max(map(len, FITS_STARTS)),
     lambda start, _whole: any(start.startswith(one[: len(start)]) for one in FITS_STARTS),
 )
-IMAGE = Kind(
+IMAGE = UploadKind(
     "/v1/images",
     *_FITS,
     ImageRow,
@@ -255,8 +255,10 @@ IMAGE = Kind(
     lambda path, state: read_summary(path, state.settings.image_limits),
     image_row,
 )
-PSF = Kind("/v1/psfs", *_FITS, PsfRow, *_FITS_START, _psf_content, uploaded_psf_row, limit="max_psf_bytes")
-TRANSIT = Kind(
+PSF = UploadKind(
+    "/v1/psfs", *_FITS, PsfRow, *_FITS_START, _psf_content, uploaded_psf_row, limit="max_psf_bytes"
+)
+TRANSIT = UploadKind(
     "/v1/transits",
     "a .zip, .tar or .tar.gz",
     "not-an-archive",
@@ -274,7 +276,7 @@ async def add_upload(
     response: Response,
     caller: Caller,
     state: State,
-    kind: Kind[Row],
+    kind: UploadKind[Row],
     *,
     equal: Callable[[str], Row | None] | None = None,
     columns: Mapping[str, str | None] | None = None,
@@ -318,7 +320,9 @@ def _advising(request: Request) -> Iterator[None]:
         raise Problem(error.status, error.code, f"{error.detail}; {advice}", **error.more) from error
 
 
-async def _receive(request: Request, path: Path, state: State, kind: Kind[Any], take: Allowed) -> RequestFile:
+async def _receive(
+    request: Request, path: Path, state: State, kind: UploadKind[Any], take: Allowed
+) -> RequestFile:
     """Write the file of a request to a path."""
     most_bytes = kind.most_bytes(state)
     text = request.headers.get("content-length", "")

@@ -37,7 +37,7 @@ Key = tuple[str, str]  # kind and id of a job or bulk run
 
 
 @dataclass(frozen=True)
-class Kind(Generic[Row]):
+class StreamKind(Generic[Row]):
     """What events tell of: jobs or bulk runs. name: of the events. view: the description of a row."""
 
     name: str
@@ -168,7 +168,7 @@ class Lookout:
     def __init__(
         self,
         owner: str,
-        kinds: Sequence[Kind[Any]],
+        kinds: Sequence[StreamKind[Any]],
         clock: Callable[[], float],
         let_in: Callable[[Any], bool],
     ) -> None:
@@ -267,7 +267,7 @@ class Lookout:
         return Sight(pages, changed, versions, states)
 
 
-def _ids(keys: Iterable[Key], kind: Kind[Any]) -> set[str]:
+def _ids(keys: Iterable[Key], kind: StreamKind[Any]) -> set[str]:
     return {identity for name, identity in keys if name == kind.name}
 
 

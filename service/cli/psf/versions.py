@@ -28,7 +28,7 @@ from service.cli.options import (
     OUTPUT_PLACE,
     PLOT,
     Command,
-    Place,
+    OutputPath,
     write_json,
     writes_files,
 )
@@ -98,7 +98,12 @@ def list_psfs(service: Client, **filters: Any) -> None:
 @on_service
 @writes_files
 def download(
-    service: Client, identity: str, output: Place, plot: Path | None, json_file: Path | None, overwrite: bool
+    service: Client,
+    identity: str,
+    output: OutputPath,
+    plot: Path | None,
+    json_file: Path | None,
+    overwrite: bool,
 ) -> None:
     """Download a PSF, and if wanted its plot and the report of its fit."""
     row = service.psf(identity)

@@ -22,7 +22,7 @@ from service.api.bulk import BulkLine
 from service.client.http import ServiceError
 from service.http import lookout
 from service.http.callers import Caller
-from service.http.lookout import Follower, Kind, Lookout, OwnerFollower
+from service.http.lookout import Follower, Lookout, OwnerFollower, StreamKind
 from service.views import JobView
 from tests.service.conftest import execute, refusal
 from tests.service.keyed import bearer, keyed
@@ -143,8 +143,8 @@ def lookout_of(
     catalogue: Catalogue, kind: str = "job", let_in: Callable[[Any], bool] = lambda _: True
 ) -> Lookout:
     """For the jobs or the bulk runs of the owner."""
-    jobs = Kind("job", catalogue.job_changes, JobView.of)
-    bulks = Kind("bulk", catalogue.bulk_changes, BulkLine.model_validate)
+    jobs = StreamKind("job", catalogue.job_changes, JobView.of)
+    bulks = StreamKind("bulk", catalogue.bulk_changes, BulkLine.model_validate)
     return Lookout(DEFAULT_OWNER, [jobs if kind == "job" else bulks], catalogue.clock, let_in)
 
 
