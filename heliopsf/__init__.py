@@ -14,6 +14,8 @@ an extra (``pip install 'heliopsf[service]'``) raises ``MissingExtra``, which na
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -48,8 +50,22 @@ _MODULES = {
     "service.client.errors": "ServiceError",
     "service.client.http": "Client",
 }
+_PACKAGES = ("psfcore", "service", "workers")  # installed beside this one
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names.split()}
 __all__ = sorted(_MODULE_OF)  # noqa: PLE0605  # a list
+
+
+def _check_packages() -> None:
+    """Raise ImportError if a file or folder of the user hides a package of heliopsf."""
+    installed = Path(__file__).resolve().parents[1]
+    for name in _PACKAGES:
+        spec = find_spec(name)
+        origin = None if spec is None else spec.origin
+        if origin is None or Path(origin).resolve().parents[1] != installed:
+            raise ImportError(
+                f"expected heliopsf's own package {name!r} in {installed}; Python finds {origin or 'none'}: rename your "
+                "file or folder of this name, or start Python in another folder"
+            )
 
 
 def __getattr__(name: str) -> Any:
@@ -59,6 +75,7 @@ def __getattr__(name: str) -> Any:
         return software_version()
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'heliopsf' has no attribute {name!r}")
+    _check_packages()
     from psfcore.errors import module_of_extra
 
     value = getattr(module_of_extra(_MODULE_OF[name]), name)

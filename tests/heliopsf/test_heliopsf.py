@@ -5,12 +5,14 @@ from __future__ import annotations
 import copy
 import gzip
 import json
+import os
 import pickle
 import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import fields, replace
 from datetime import UTC, datetime
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from types import SimpleNamespace
@@ -241,3 +243,25 @@ def test_files_and_psfs_give_the_same_psf_between_two_times(tmp_path: Path) -> N
     for changes, code in wrong:
         with pytest.raises(heliopsf.DataError, match=code):
             heliopsf.interpolate_psf(**(given | changes))
+
+
+def test_a_file_of_the_user_that_hides_a_package_is_named(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    command = Path(sys.executable).with_name("heliopsf")
+    for name, hiding in (
+        ("service", tmp_path / "a" / "service.py"),
+        ("workers", tmp_path / "b" / "workers" / "__init__.py"),
+    ):
+        with subtests.test(name):
+            hiding.parent.mkdir(parents=True)
+            hiding.write_text("raise RuntimeError('the file of the user ran')\n")
+            folder = tmp_path / hiding.relative_to(tmp_path).parts[0]
+            code = "import heliopsf\ntry:\n    heliopsf.deconvolve\nexcept ImportError as error:\n    print(error)"
+            environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+            run = partial(
+                subprocess.run, cwd=folder, env=environment, capture_output=True, text=True, check=False
+            )
+            said = run([sys.executable, "-c", code])
+            assert f"package {name!r}" in said.stdout and str(hiding) in said.stdout and said.stderr == "", (
+                said
+            )
+            assert run([command, "--version"]).returncode == 0
