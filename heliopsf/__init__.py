@@ -63,8 +63,8 @@ def _check_packages() -> None:
         origin = None if spec is None else spec.origin
         if origin is None or Path(origin).resolve().parents[1] != installed:
             raise ImportError(
-                f"expected heliopsf's own package {name!r} in {installed}; Python finds {origin or 'none'}: rename your "
-                "file or folder of this name, or start Python in another folder"
+                f"expected heliopsf's own package {name!r} in {installed}; Python finds {origin or 'none'}: rename "
+                "your file or folder of this name, or start Python in another folder"
             )
 
 

@@ -291,7 +291,7 @@ def _blocks(size: int, threads: int) -> list[slice]:
 
 
 @compiled(fastmath=True)
-def _fold_strip(strip, within, of_period, folded):  # type: ignore[no-untyped-def]
+def _fold_strip(strip, within, of_period, folded):  # type: ignore[no-untyped-def]  # compiled
     """folded[y, m] = sum over k of c[y, m + k n] exp(-2 pi i turns (m + k n) / n)."""
     rows, cells = strip.shape
     size = len(within)
@@ -310,7 +310,7 @@ def _fold_strip(strip, within, of_period, folded):  # type: ignore[no-untyped-de
 
 
 @compiled(fastmath=True)
-def _fold_block(spectra, cells, within, of_period, field, start, stop):  # type: ignore[no-untyped-def]
+def _fold_block(spectra, cells, within, of_period, field, start, stop):  # type: ignore[no-untyped-def]  # compiled
     """field[m] = sum over k of spectra[m + k n] exp(-2 pi i turns (m + k n) / n).
 
     Rows of spectra that were not computed are mirror images of computed rows.
@@ -329,7 +329,7 @@ def _fold_block(spectra, cells, within, of_period, field, start, stop):  # type:
 
 
 @compiled(fastmath=True)
-def _add_intensity(field, total, weight):  # type: ignore[no-untyped-def]
+def _add_intensity(field: NDArray[np.complex128], total: NDArray[np.float64], weight: float) -> None:
     rows, columns = field.shape
     for y in range(rows):
         for x in range(columns):

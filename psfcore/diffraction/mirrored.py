@@ -183,7 +183,7 @@ _W = np.uint64(LANES)
 
 
 @compiled()
-def _fill_lanes(strip, first, lanes):  # type: ignore[no-untyped-def]
+def _fill_lanes(strip, first, lanes):  # type: ignore[no-untyped-def]  # compiled
     """lanes[i, half, lane] = strip[row, first + i], with row = 16 half + lane; 0 where the strip has no such row."""
     rows = strip.shape[0]
     for low in range(0, len(lanes), LANES):
@@ -196,7 +196,7 @@ def _fill_lanes(strip, first, lanes):  # type: ignore[no-untyped-def]
 
 
 @compiled(fastmath=_FAST)
-def _transform(lanes, cells, turn, buffer, plan):  # type: ignore[no-untyped-def]
+def _transform(lanes, cells, turn, buffer, plan):  # type: ignore[no-untyped-def]  # compiled
     """Compute the sum of Eq. (3) into `buffer`, from the `cells` first rows of `lanes`.
 
     turn[i]: the factor of cell i in Eq. (2), for i < cells; 0 for the further cells that complete a round.
@@ -238,7 +238,7 @@ def _transform(lanes, cells, turn, buffer, plan):  # type: ignore[no-untyped-def
 
 
 @compiled(fastmath=_FAST)
-def _keep_field(buffer, at, turn, field, first_row, corner):  # type: ignore[no-untyped-def]
+def _keep_field(buffer, at, turn, field, first_row, corner):  # type: ignore[no-untyped-def]  # compiled
     """field[block of columns, first_row + row, half, lane] = E of 32 rows, for all pixels of a row."""
     z = buffer.reshape((-1, 2, LANES))
     for group in range(len(at) // LANES):
@@ -255,7 +255,7 @@ def _keep_field(buffer, at, turn, field, first_row, corner):  # type: ignore[no-
 
 
 @compiled(fastmath=_FAST)
-def _add_intensity(buffer, at, turn, total, weight):  # type: ignore[no-untyped-def]
+def _add_intensity(buffer, at, turn, total, weight):  # type: ignore[no-untyped-def]  # compiled
     """total[pixel, half, lane] += weight E^2 for all pixels of 32 columns."""
     z = buffer.reshape((-1, 2, LANES))
     for pixel in range(len(total)):

@@ -102,7 +102,7 @@ def airy_kernel(
 
 
 @compiled()
-def _edge_fluxes(table, steps_per_px, half, near, far):  # type: ignore[no-untyped-def]
+def _edge_fluxes(table, steps_per_px, half, near, far):  # type: ignore[no-untyped-def]  # compiled
     """Flux of B / (2 pi r) in the direction +x through the right edge of each pixel [x, y] of one quadrant."""
     flux = np.empty((half + 1, half + 1))
     for i in range(half + 1):
@@ -171,7 +171,7 @@ def _edges(aperture: Aperture) -> tuple[Vector, Vector, float]:
 
 
 @compiled()
-def _cast(kernel, cosines, sines, weights):  # type: ignore[no-untyped-def]
+def _cast(kernel: Kernel, cosines: Vector, sines: Vector, weights: Vector) -> None:
     """Move the light of each line, Eq. (4), from the central pixel to the pixels that the line crosses, on both
     sides.
     """

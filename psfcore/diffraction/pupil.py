@@ -270,7 +270,7 @@ def _edges_by_row(edges: NDArray[np.float64], rows: int) -> tuple[NDArray[np.int
 
 
 @compiled()
-def _cover(strip, area, ranges, first_row, line, edges, outline_of_edge, first_entry, entries):  # type: ignore[no-untyped-def]
+def _cover(strip, area, ranges, first_row, line, edges, outline_of_edge, first_entry, entries):  # type: ignore[no-untyped-def]  # compiled
     """Write the open share of each cell into `strip`.
 
     The open share of a cell is the product of its open shares in the meshes, in the opening (outline 0) and in all
@@ -308,7 +308,7 @@ def _cover(strip, area, ranges, first_row, line, edges, outline_of_edge, first_e
 
 
 @compiled()
-def _insert(begins, ends, count, begin, end):  # type: ignore[no-untyped-def]
+def _insert(begins: NDArray[np.int64], ends: NDArray[np.int64], count: int, begin: int, end: int) -> None:
     """Insert a range of cells into a list that is sorted by first cell."""
     j = count
     while j > 0 and begins[j - 1] > begin:
@@ -318,7 +318,7 @@ def _insert(begins, ends, count, begin, end):  # type: ignore[no-untyped-def]
 
 
 @compiled()
-def _apply(row, line, line_y, start, stop, inside, outline):  # type: ignore[no-untyped-def]
+def _apply(row, line, line_y, start, stop, inside, outline):  # type: ignore[no-untyped-def]  # compiled
     """Apply one outline to the cells from `start` to `stop` - 1. inside: the share of their area inside the outline.
 
     Outline 0, the opening, sets the open share of these cells. Every other outline is opaque and reduces the open
@@ -335,7 +335,7 @@ def _apply(row, line, line_y, start, stop, inside, outline):  # type: ignore[no-
 
 
 @compiled()
-def _add_edge(area, edge, row, cells):  # type: ignore[no-untyped-def]
+def _add_edge(area, edge, row, cells):  # type: ignore[no-untyped-def]  # compiled
     """Add the part of an edge that lies in a row, Eq. (1), to `area`. The running sum of `area` is the covered share.
 
     Returns the first and last cell that the edge crosses. If the edge crosses no cell, the last is before the first.
@@ -373,7 +373,7 @@ def _add_edge(area, edge, row, cells):  # type: ignore[no-untyped-def]
 
 
 @compiled()
-def _shade(strip, first_row, open_share, cells_per_pixel):  # type: ignore[no-untyped-def]
+def _shade(strip, first_row, open_share, cells_per_pixel):  # type: ignore[no-untyped-def]  # compiled
     """Multiply `strip` by the mean of a picture over each cell. Everything outside the picture is opaque."""
     rows, cells = strip.shape
     pixels = len(open_share)
@@ -397,7 +397,7 @@ def _shade(strip, first_row, open_share, cells_per_pixel):  # type: ignore[no-un
 
 
 @compiled()
-def _running_at(running, x):  # type: ignore[no-untyped-def]
+def _running_at(running: NDArray[np.float64], x: float) -> Any:
     """The running sum at a position between pixels, interpolated linearly."""
     last = len(running) - 1
     if x <= 0:

@@ -43,7 +43,7 @@ class _LazyFields(Sequence[Field]):
     def __len__(self) -> int:
         return self._count
 
-    def __getitem__(self, index):  # type: ignore[no-untyped-def]
+    def __getitem__(self, index):  # type: ignore[no-untyped-def]  # the overloads of Sequence
         return self._field(index)
 
 

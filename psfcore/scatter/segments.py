@@ -212,7 +212,7 @@ def segment_sums(
 
 
 @compiled()
-def _strips(targets):  # type: ignore[no-untyped-def]
+def _strips(targets):  # type: ignore[no-untyped-def]  # compiled
     """Index of the strip of each target, and (y, x) of the first pixel of each strip. Targets are sorted by y, then
     x.
     """
@@ -229,7 +229,7 @@ def _strips(targets):  # type: ignore[no-untyped-def]
 
 
 @compiled()
-def _running_sums(image, top, first, running):  # type: ignore[no-untyped-def]
+def _running_sums(image, top, first, running):  # type: ignore[no-untyped-def]  # compiled
     """P of Eq. (4) for the four rows that begin at `top`, at indices that begin at `first`.
 
     P is constant beyond the columns of the image. If fewer than four rows remain, the last row of the image fills the
@@ -253,7 +253,7 @@ def _running_sums(image, top, first, running):  # type: ignore[no-untyped-def]
 
 
 @compiled()
-def _accumulate(image, strip_yx, runs, first, running, sums):  # type: ignore[no-untyped-def]
+def _accumulate(image, strip_yx, runs, first, running, sums):  # type: ignore[no-untyped-def]  # compiled
     ny, lanes, first_dy = image.shape[0], sums.shape[2], runs.first_dy
     row, dx_start, dx_stop, segment = runs.row, runs.dx_start, runs.dx_stop, runs.segment
     rows_of_runs = len(row) - 1

@@ -298,7 +298,7 @@ def _radius_index(size: int) -> NDArray[np.int32]:
 
 
 @compiled()
-def _power_law_of_ellipses(size, b, c, p, q):  # type: ignore[no-untyped-def]
+def _power_law_of_ellipses(size, b, c, p, q):  # type: ignore[no-untyped-def]  # compiled
     """The falloff of Eq. (2) with the radius r of Eq. (3), on (size, size)."""
     out = np.empty((size, size))
     s = math.hypot(p, q)

@@ -148,7 +148,7 @@ def on_service(command: Command) -> Command:
         with remote() as service:
             return command(service=service, **given)
 
-    return connected  # type: ignore[return-value]
+    return connected  # type: ignore[return-value]  # wraps keeps the signature
 
 
 def print_rows(rows: Iterable[Thing], line: Callable[[Thing], str], *, if_none: str) -> None:

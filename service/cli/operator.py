@@ -97,7 +97,7 @@ def on_catalogue(command: Command) -> Command:
         finally:
             catalogue.close()
 
-    return opened  # type: ignore[return-value]
+    return opened  # type: ignore[return-value]  # wraps keeps the signature
 
 
 # The database ------------------------------------------------------------------------------

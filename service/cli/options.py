@@ -206,7 +206,7 @@ class OutputFolder(_Output):
 class OutputPlace(OutputFile):
     """The type of an option that names a file to write, or a folder in which the command chooses the file name."""
 
-    def convert(  # type: ignore[override]
+    def convert(  # type: ignore[override]  # more than a path
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> OutputPath:
         """The path, and whether it is a folder: a folder of this name exists, or the text ends in a slash."""
@@ -303,7 +303,7 @@ def writes_files(command: Command) -> Command:
         _check_files(click.get_current_context().command.params, given)
         return command(**given)
 
-    return checked  # type: ignore[return-value]
+    return checked  # type: ignore[return-value]  # wraps keeps the signature
 
 
 def _check_files(parameters: Sequence[click.Parameter], given: dict[str, Any]) -> None:
