@@ -242,7 +242,14 @@ def hexagonal_mesh_kernel(
 
 
 @compiled()
-def _add_orders(kernel, reach_px, open_share, width_px, cosine, sine):  # type: ignore[no-untyped-def]  # compiled
+def _add_orders(
+    kernel: NDArray[np.float64],
+    reach_px: float,
+    open_share: float,
+    width_px: float,
+    cosine: float,
+    sine: float,
+) -> None:
     """Add all orders of Eq. (7) to their pixels. reach_px: lambda z / d; open_share: w / d."""
     size = kernel.shape[0]
     origin = size // 2 + 0.5  # pixel i extends from i to i + 1
