@@ -68,13 +68,13 @@ SCENES_KEPT = 24
 class Slice:
     """A row or a column of pixels through the centre of an occulter.
 
-    offset_px: distance of each pixel from the centre, with sign. observed, simulated: intensities, DN/s. dark: True for
-    fully dark pixels.
+    offset_px: distance of each pixel from the centre, with sign. observed_dn_s, simulated_dn_s: intensities. dark: True
+    for fully dark pixels.
     """
 
     offset_px: Vector
-    observed: Vector
-    simulated: Vector
+    observed_dn_s: Vector
+    simulated_dn_s: Vector
     dark: Flags
 
 

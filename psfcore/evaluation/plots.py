@@ -106,7 +106,7 @@ def _draw_slices(axes: Any, frame: FrameEvaluation) -> None:
     ):
         axes.plot(
             along.offset_px,
-            along.observed,
+            along.observed_dn_s,
             marker,
             color=face,
             markersize=3.4,
@@ -115,7 +115,7 @@ def _draw_slices(axes: Any, frame: FrameEvaluation) -> None:
         )
         axes.plot(
             along.offset_px,
-            along.simulated,
+            along.simulated_dn_s,
             color=line,
             linestyle=dashes,
             linewidth=1.6,

@@ -188,8 +188,13 @@ class LocalWorkspace(Workspace):
             return source(
                 lambda _, progress: replace(self._kept(recipe, progress, parts=False), status=PsfStatus.DRAFT)
             )
-        psf = self.psf(request.psf_id, parts=request.error_draws > 0)
-        return source(lambda *_: psf, key=id(psf), kernel_shape=psf.kernel.shape)
+        parts, named = request.error_draws > 0, self.inputs.psfs.get(request.psf_id)
+        psf = self.psf(request.psf_id, parts=parts)
+        return source(
+            lambda *_: psf if named is None else named.seen_as(psf),
+            key=(request.psf_id, parts),
+            kernel_shape=psf.kernel.shape,
+        )
 
     def psf(self, identity: str, *, parts: bool = True) -> Psf:
         key = identity, parts
@@ -200,7 +205,7 @@ class LocalWorkspace(Workspace):
             psf = self._kept(recipe_of(build), parts=False)
         elif named is not None:
             check_unchanged(named.states)
-            psf = named.seen_as(read_psf(named.path, LIMITS, parts=parts))
+            psf = read_psf(named.path, LIMITS, parts=parts)
         else:
             raise no_such("psf", identity)
         return self.inputs.psfs_read.setdefault(key, psf)

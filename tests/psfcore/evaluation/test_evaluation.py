@@ -147,13 +147,13 @@ def test_slices_run_through_the_middle_of_discs() -> None:
     assert frame.along_x is not None and frame.along_y is not None
     y, x = round(frame.found.place.y_px), round(frame.found.place.x_px)
     pixels = found.transit.frames[frame.index].pixels
-    np.testing.assert_array_equal(frame.along_x.observed, pixels[y, x - 20 : x + 21])
-    np.testing.assert_array_equal(frame.along_y.observed, pixels[y - 20 : y + 21, x])
+    np.testing.assert_array_equal(frame.along_x.observed_dn_s, pixels[y, x - 20 : x + 21])
+    np.testing.assert_array_equal(frame.along_y.observed_dn_s, pixels[y - 20 : y + 21, x])
     assert frame.along_x.offset_px[20] == pytest.approx(x - frame.found.place.x_px)
     assert {int(along.dark.sum()) for along in (frame.along_x, frame.along_y)} <= {20, 21}
     row = frame.dark[0] == y
-    np.testing.assert_allclose(frame.along_x.simulated[frame.along_x.dark], frame.simulated[row])
-    assert (frame.along_x.simulated > frame.along_x.observed)[frame.along_x.dark].all()
+    np.testing.assert_allclose(frame.along_x.simulated_dn_s[frame.along_x.dark], frame.simulated[row])
+    assert (frame.along_x.simulated_dn_s > frame.along_x.observed_dn_s)[frame.along_x.dark].all()
     # At the edge of the field, slices end where the field ends.
     frame = judged().frames[0]
     assert frame.along_x is not None
