@@ -122,8 +122,10 @@ def _draw_slices(axes: Any, frame: FrameEvaluation) -> None:
             label=f"simulated {name}",
         )
     # The axis is scaled to the light in the disc, because the light outside may be a hundred times brighter.
-    middle = np.concatenate([s.observed[np.abs(s.offset_px) <= 14] for s in (frame.along_x, frame.along_y)])
-    inner = np.concatenate([s.simulated[s.dark] for s in (frame.along_x, frame.along_y)])
+    middle = np.concatenate(
+        [s.observed_dn_s[np.abs(s.offset_px) <= 14] for s in (frame.along_x, frame.along_y)]
+    )
+    inner = np.concatenate([s.simulated_dn_s[s.dark] for s in (frame.along_x, frame.along_y)])
     top = min(float(middle.max()), 4 * float(inner.max(initial=1e-9)))
     axes.set(
         xlim=(-20.5, 20.5),
