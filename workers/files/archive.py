@@ -242,11 +242,15 @@ def _entries(folder: Path) -> list[os.DirEntry[str]]:
 
 
 def _resolved(path: Path) -> Path:
-    """The path with all links resolved. Raises OSError."""
+    """The path with all links resolved. Raises OSError for circular links, which `Path.resolve` treats in its own way in
+    each version of Python.
+    """
     try:
-        return path.resolve()
-    except RuntimeError as error:  # Python before 3.13 raises this for circular links
-        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP)) from error
+        os.stat(path)
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise
+    return Path(os.path.realpath(path))
 
 
 def reason_of(error: OSError) -> str:
