@@ -242,8 +242,8 @@ def _entries(folder: Path) -> list[os.DirEntry[str]]:
 
 
 def _resolved(path: Path) -> Path:
-    """The path with all links resolved. Raises OSError for circular links, which `Path.resolve` treats in its own way in
-    each version of Python.
+    """The path with all links resolved. Raises OSError for circular links, which `Path.resolve` treats in its own way
+    in each version of Python.
     """
     try:
         os.stat(path)
