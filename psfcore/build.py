@@ -49,12 +49,15 @@ def build_psf(
 ) -> Psf:
     """Compute the total PSF of `instrument`, with its components; its shape is (size, size).
 
-    size: an even number from 64 to 4096 (px). component: build only this component, such as "DIFFRACTION"; the result
-    is then a PSF without components. parts: False: compute only what the total PSF needs, and return it without
-    components. The kernel is the same bit for bit. mount_image: pixels of the mount's mask image [y, x], row 0 at the
-    lowest y (see `psfcore.fits.images`). progress: called with (step, steps); it may raise to stop the work. Raises
-    DataError "bad-size", "unknown-component", "bad-mount", or "bad-instrument-file" if the file describes an instrument
-    that needs arrays that are too large.
+    - `size`: an even number from 64 to 4096, px.
+    - `component`: the only component to build, such as "DIFFRACTION"; the result is then a PSF without components.
+    - `parts`: if it is False, only what the total PSF needs is computed, and the PSF has no components. Its kernel is
+      the same as with True, bit for bit.
+    - `mount_image`: pixels of the mount's mask image [y, x], row 0 at the lowest y (see `psfcore.fits.images`).
+    - `progress` is called with (step, steps); it may raise to stop the work.
+
+    Raises DataError "bad-size", "unknown-component" or "bad-mount", and "bad-instrument-file" if the instrument needs
+    arrays that are too large.
     """
     if size % 2 or not SMALLEST_SIZE_PX <= size <= LARGEST_SIZE_PX:
         expected = f"an even size of {SMALLEST_SIZE_PX} to {LARGEST_SIZE_PX} px"

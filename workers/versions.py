@@ -146,7 +146,7 @@ def check_transition(before: PsfStatus, after: PsfStatus) -> None:
         allowed = " or ".join(sorted(MAY_BECOME[before]))
         advice = ": certify another PSF in its place" if before == PsfStatus.DEPRECATED else ""
         raise DataError(
-            "wrong-transition", f"expected status {allowed} for a {before} PSF; got {after}{advice}"
+            "wrong-transition", f"expected the new status {allowed} for a {before} PSF; got {after}{advice}"
         )
 
 

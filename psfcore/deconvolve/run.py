@@ -204,7 +204,7 @@ def deconvolve(
     Raises DataError "no-noise-figures", "no-noise-model", and the errors of `box_work` and of the method.
     """
     if options.noise is None and options.parameters.get("stop") == "discrepancy":
-        raise no_noise_model()  # figures that nobody chose are too uncertain to end an iteration
+        raise no_noise_model()  # measured noise is too uncertain to end an iteration
     noise = None
     if options.error_draws:
         from psfcore.deconvolve.camera_noise import camera_noise  # most deconvolutions do not load SciPy
@@ -230,11 +230,14 @@ def deconvolve(
 class PsfSource:
     """The PSF of a deconvolution, which is read or built when it is needed.
 
-    load(header, progress): reads it, or builds it for an image with this header. possible_psfs(psf, header): variants
-    of the PSF within its errors, on the pixels of the image. key: the same for the same PSF; None: the PSF belongs to
-    the telescope in the header. kernel_shape: (ny, nx) of its kernel. plate_scale_arcsec: of a PSF that gives none.
-    prepared: keeps PSFs and engines between images. other_channel: see `input_warnings`. warnings: sentences about the
-    PSF, by their codes.
+    - `load(header, progress)` reads it, or builds it for an image with this header.
+    - `possible_psfs(psf, header)`: variants of the PSF within its errors, on the pixels of the image.
+    - `key`: the same for the same PSF; None: the PSF belongs to the telescope in the header.
+    - `kernel_shape`: (ny, nx) of its kernel. `plate_scale_arcsec`: of a PSF that gives none.
+    - `prepared` keeps PSFs and engines between images. `other_channel`: see `input_warnings`.
+    - `seen_as` adds the instrument and the wavelength that the file does not name, for the checks.
+    - `used`: how cards name it; None: as the PSF says. `provenance`: of a PSF whose file does not say it.
+    - `warnings`: sentences about the PSF, by their codes.
     """
 
     load: Callable[[Header, Progress | None], Psf]
@@ -244,6 +247,9 @@ class PsfSource:
     plate_scale_arcsec: float | None = None
     prepared: PreparedPsfs = field(default_factory=PreparedPsfs)
     other_channel: bool = False
+    seen_as: Callable[[Psf], Psf] = lambda psf: psf
+    used: UsedPsf | None = None
+    provenance: Mapping[str, Any] | None = None
     warnings: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -301,11 +307,11 @@ def read_and_deconvolve(
     of_telescope = known_instrument(header), frame_of(header).turn_to_build_deg
     key = (of_telescope if source.key is None else source.key, source.plate_scale_arcsec)
     whole = prepared.as_built(key, as_built)
-    check_channel(whole, header, other_channel=source.other_channel)
+    check_channel(source.seen_as(whole), header, other_channel=source.other_channel)
     fitted = prepared.on_pixels_of(header, key, as_built)
     warnings = {
         **source.warnings,
-        **input_warnings(fitted, image, options.method, other_channel=source.other_channel),
+        **input_warnings(source.seen_as(fitted), image, options.method, other_channel=source.other_channel),
     }
     for code, message in warnings.items():
         say(code, message)

@@ -58,9 +58,9 @@ _LAW = 3  # number of parameters of the power law: b, c and total are the first 
 
 @dataclass(frozen=True)
 class CurveBound:
-    """1 - encircled energy, in percent, of the total PSF and of the scatter kernel (diffuse) at one radius.
+    """The light beyond one radius (1 - encircled energy), percent: of the total PSF, and of its scatter kernel alone.
 
-    total_sigma, diffuse_sigma: standard errors, in percentage points.
+    `total_sigma` and `diffuse_sigma` are the standard errors of the two, in percentage points.
     """
 
     radius_px: float

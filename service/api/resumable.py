@@ -206,7 +206,7 @@ async def _append(request: Request, file: BinaryIO, upload: PartialUpload, take:
             raise Problem(
                 460,
                 "wrong-checksum",
-                "expected bytes with the declared checksum; got others: send them again",
+                "expected bytes with the declared checksum; got bytes with another checksum: send this part again",
             )
         whole = True
     except ClientDisconnect as error:

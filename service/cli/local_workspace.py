@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from psfcore.deconvolve.conditions import PreparedPsfs
-from psfcore.deconvolve.run import BUILDING, PsfSource
+from psfcore.deconvolve.run import BUILDING, PsfSource, UsedPsf
 from psfcore.fits.blocks import LIMITS, FitsLimits
 from psfcore.fits.header import HeaderSummary, read_summary
 from psfcore.fits.psfs import read_psf
@@ -84,14 +84,7 @@ class PsfFile(ImageFile):
         angstrom = psf.wavelength_angstrom
         if angstrom is None and channel.isdecimal():
             angstrom = float(channel)
-        return replace(
-            psf,
-            name=self.name,
-            version=self.version,
-            status=PsfStatus.DRAFT,
-            instrument=instrument,
-            wavelength_angstrom=angstrom,
-        )
+        return replace(psf, name=self.name, instrument=instrument, wavelength_angstrom=angstrom)
 
 
 @dataclass(frozen=True)
@@ -185,15 +178,14 @@ class LocalWorkspace(Workspace):
         build = request.psf_recipe
         if build is not None:
             recipe = recipe_of(build)
-            return source(
-                lambda _, progress: replace(self._kept(recipe, progress, parts=False), status=PsfStatus.DRAFT)
-            )
+            return source(lambda _, progress: self._kept(recipe, progress, parts=False))
         parts, named = request.error_draws > 0, self.inputs.psfs.get(request.psf_id)
         psf = self.psf(request.psf_id, parts=parts)
+        source = partial(source, lambda *_: psf, key=(request.psf_id, parts), kernel_shape=psf.kernel.shape)
+        if named is None:
+            return source()
         return source(
-            lambda *_: psf if named is None else named.seen_as(psf),
-            key=(request.psf_id, parts),
-            kernel_shape=psf.kernel.shape,
+            seen_as=named.seen_as, used=UsedPsf(request.psf_id, named.name, named.version, PsfStatus.DRAFT)
         )
 
     def psf(self, identity: str, *, parts: bool = True) -> Psf:
@@ -227,7 +219,8 @@ class LocalWorkspace(Workspace):
         return kept_psf(psf_cache(), recipe, LIMITS, threads=self.threads, progress=progress, **how)
 
     @contextmanager
-    def unpacked(self, transit_id: str) -> Iterator[tuple[Path, int]]:
+    def unpacked(self, transit_id: str) -> Iterator[Path]:
         transit = self.inputs.transits[transit_id]
+        self.report("reading", 0, len(transit.contents.manifest.images))
         with transit.folder() as folder:
-            yield folder, len(transit.contents.manifest.images)
+            yield folder

@@ -106,8 +106,8 @@ def json_of(store: Store, digest: str, size: int | None = None) -> dict[str, Any
 def path_of(store: Store, digest: str, size: int | None = None) -> Path:
     """The path of a stored file, after a check. Raises ``Problem`` 410 if the file is lost or damaged.
 
-    size: the recorded size of the file, bytes; the check then reads only the size. None: the check reads the whole
-    file, which must therefore be small.
+    With `size`, the recorded size of the file in bytes, the check compares the sizes alone. Without it, the check reads
+    the whole file to compute its SHA-256: use this for small files.
     """
     try:
         if size is not None:

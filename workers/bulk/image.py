@@ -64,7 +64,10 @@ class Destination:
 
 @dataclass(frozen=True)
 class Ready:
-    """An image that was read and can be deconvolved. start_s: its estimated time (``Estimate.start_s``)."""
+    """An image that was read and can be deconvolved.
+
+    `start_s` is the estimated time of its deconvolution, s, before the measured factor is applied.
+    """
 
     request: ResolvedDeconvolve
     image: Image

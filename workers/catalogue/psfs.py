@@ -367,7 +367,8 @@ def _refuse(change: StatusChange, other: str, **given: object) -> None:
         if value is not None:
             raise DataError(
                 "not-of-this-change",
-                f"{name}: expected this field only in a {other}; got it with status {change.status}: leave it out",
+                f"{name}: expected this field only in a {other}; got it in a change to status {change.status}: leave "
+                "the field out",
             )
 
 

@@ -70,7 +70,7 @@ NOT_KEPT = "the result of this job could not be kept"  # a reason for Usage.no_r
 
 BATCH = 1000  # rows that are read at once
 _DIGEST = re.compile(r"[0-9a-f]{64}")
-# This table is very long. The tables of images and products also refer to all of its files.
+# The table of the images of bulk runs is very long, and the tables of images and products refer to all of its files.
 _SKIPPED = frozenset({BulkItemRow.__tablename__})
 
 

@@ -104,7 +104,7 @@ def uploaded_psf_row(
 
 
 def _summary(summary: HeaderSummary) -> dict[str, Any]:
-    """The summary of a header as JSON. A card may continue over thousands of cards; its text is cut."""
+    """The summary of a header as JSON. Each text is cut, because one text may continue over thousands of cards."""
     return _cut(dataclasses.asdict(summary))
 
 

@@ -97,35 +97,28 @@ class CatalogueWorkspace(Workspace):
 
     def psf_source(self, request: ResolvedDeconvolve) -> PsfSource:
         # A worker loads numerical libraries with its first job.
-        from psfcore.deconvolve.run import PsfSource
+        from psfcore.deconvolve.run import PsfSource, UsedPsf
         from psfcore.psf_sampling import with_scale
         from workers.tasks.deconvolve import possible_psfs, prepared_psfs
 
         row, scale = self._requested_psf(request), request.plate_scale_arcsec
-        provenance = row.details.get("provenance") or {}
 
-        def load(_header: Header, _progress: object) -> Psf:
-            psf = self.psf_of(row, parts=False)
+        def seen_as(psf: Psf) -> Psf:
             # The request of an upload or of a certification may say what the file does not contain.
             instrument, angstrom = of_upload(row, psf.instrument, psf.wavelength_angstrom)
-            return replace(
-                psf,
-                name=row.name,
-                version=row.version,
-                status=row.status,
-                instrument=instrument,
-                wavelength_angstrom=angstrom,
-                provenance={**provenance, **psf.provenance},
-            )
+            return replace(psf, instrument=instrument, wavelength_angstrom=angstrom)
 
         def possible(_psf: Psf, header: Header) -> Sequence[Psf]:
             return possible_psfs(with_scale(self.psf_of(row), scale), header, threads=self.threads)
 
         deprecated = deprecated_warning(self.catalogue, row)
         return PsfSource(
-            load,
+            lambda *_: self.psf_of(row, parts=False),
             possible,
-            key=(row.file_sha256, self.settings.psf_limits, row.name, row.version, row.status),
+            key=(row.file_sha256, self.settings.psf_limits),
+            seen_as=seen_as,
+            used=UsedPsf(row.id, row.name, row.version, row.status),
+            provenance=row.details.get("provenance"),
             plate_scale_arcsec=scale,
             prepared=prepared_psfs(self.settings.psf_cache_mib * 2**20),
             # A rerun repeats an earlier deconvolution, even if it was made by a version that did not compare channels.
@@ -150,8 +143,7 @@ class CatalogueWorkspace(Workspace):
                 raise DataError(
                     "interpolation-changed",
                     f"expected the interpolation that gave PSF {request.psf_id} when the job was submitted; this "
-                    "version "
-                    "interpolates in another way: submit the job again",
+                    "version interpolates in another way: submit the job again",
                 )
             KINDS["psf-interpolate"].load_task()(self, interpolation.model_dump())
         elif recipe is not None:
@@ -169,10 +161,11 @@ class CatalogueWorkspace(Workspace):
         return self.psf(KINDS["psf-build"].load_task()(self, build.model_dump()), parts=False)
 
     @contextmanager
-    def unpacked(self, transit_id: str) -> Iterator[tuple[Path, int]]:
+    def unpacked(self, transit_id: str) -> Iterator[Path]:
         images = int(self.row(TransitRow, transit_id).summary["images"])
+        self.report("reading", 0, images)
         with self.store.unpacked(transit_id, self.settings.archive_limits) as folder:
-            yield folder, images
+            yield folder
 
     def inverter(self, request: ResolvedOnTransit) -> Inverter:
         from workers.tasks.solutions import (
@@ -192,15 +185,23 @@ class CatalogueWorkspace(Workspace):
         return self.made(TABLES[result], identity) is not None
 
     def add(self, result: Result) -> None:
-        self.keep(result)
+        row = self.stored(result)
+        if result.type == ResultType.PRODUCT:
+            self.report(
+                "saving", 1, 1
+            )  # raises an exception if the job must stop, so that no product is kept
+        self.add_row(row)
 
     def keep(self, result: Result) -> ResultRow:
-        """Write the files of a result into the store and add its row; returns the row in the catalogue.
+        """Write the files of a result into the store and add its row; returns the row in the catalogue."""
+        return self.add_row(self.stored(result))
+
+    def add_row(self, row: Any) -> ResultRow:
+        """Add the row of a result, whose files are in the store; returns the row in the catalogue.
 
         If an earlier result has this identity and has lost a file, its row gets the new files. Raises DataError
         "psf-not-the-same" if this would change the content of a PSF that was certified.
         """
-        row: Any = self.stored(result)
         earlier, new = self.catalogue.add(row)
         kept: ResultRow = earlier
         if new or intact(self.store, kept):
@@ -213,8 +214,8 @@ class CatalogueWorkspace(Workspace):
             raise DataError(
                 "psf-not-the-same",
                 f"expected the lost file of PSF {kept.id} to be made again bit for bit, because the PSF was "
-                "certified; this "
-                "version of the software makes another file: ask the operator to restore the store from a backup",
+                "certified; this version of the software makes another file: ask the operator to restore the store "
+                "from a backup",
             )
         refiled: ResultRow = self.catalogue.refile(row)
         return refiled

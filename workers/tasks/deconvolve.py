@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 from astropy.io.fits import Header
 
@@ -23,6 +24,7 @@ from workers.files.archive import safe_name
 from workers.machine import free_bytes
 from workers.settings import library_versions, software_version
 from workers.tasks.workspace import Result, Workspace, task_of
+from workers.versions import PsfStatus
 
 
 @task_of("deconvolve")
@@ -32,9 +34,10 @@ def deconvolve(workspace: Workspace, request: ResolvedDeconvolve, _identity: str
     Raises DataError "no-such-image", "no-such-psf", "instrument-changed", "channel-mismatch", "no-noise-figures",
     "already-deconvolved", "psf-as-image", and the errors of reading the image and of the method.
     """
-    file = workspace.image_file(request.image_id)
-    workspace.add(make(workspace, request, lambda: load(workspace, request, file)))
-    workspace.report("saving", 1, 1)
+    # The path is taken only when the image is read: a local copy of the store may be removed while a PSF is built.
+    workspace.add(
+        make(workspace, request, lambda: load(workspace, request, workspace.image_file(request.image_id)))
+    )
 
 
 def load(workspace: Workspace, request: ResolvedDeconvolve, path: Path) -> Image:
@@ -62,9 +65,10 @@ def make(
             workspace.report(stage, 0, steps)
         return lambda step, steps: workspace.report(stage, step, steps)
 
+    source = workspace.psf_source(request)
     product, psf = run.read_and_deconvolve(
         read,
-        workspace.psf_source(request),
+        source,
         options_of(request, workspace.threads),
         shape=workspace.shape_to_check(request),
         free_bytes=free_bytes(),
@@ -73,14 +77,21 @@ def make(
         begin=begin,
     )
     workspace.report("saving", 0, 1)
-    used = UsedPsf(request.psf_id, psf.name, psf.version, psf.status)
-    return product_result(request, product, used, job_id=workspace.job_id, preview=preview)
+    used = source.used or UsedPsf(request.psf_id, psf.name, psf.version, PsfStatus.DRAFT)
+    details = product.details(used, source.provenance)
+    return product_result(request, product, used, details, job_id=workspace.job_id, preview=preview)
 
 
 def product_result(
-    request: ResolvedDeconvolve, product: Product, psf: UsedPsf, *, job_id: str, preview: bool = True
+    request: ResolvedDeconvolve,
+    product: Product,
+    psf: UsedPsf,
+    details: Mapping[str, Any],
+    *,
+    job_id: str,
+    preview: bool = True,
 ) -> Result:
-    """The product of a request, whose files are not yet written. psf: as the cards name it."""
+    """The product of a request, whose files are not yet written. psf: as the cards name it. details: of the product."""
     identity = product_identity(request)
     # The name depends only on the content of the input and on the request.
     filename = safe_name(optional_text(product.image.header, "FILENAME") or "heliopsf", identity)
@@ -101,7 +112,7 @@ def product_result(
             "libraries": library_versions(),
             "parameters": request.model_dump(mode="json", exclude_none=True),
             "job_id": job_id,
-            **product.details(psf),
+            **details,
         },
         files | {"thumbnail": lambda path: write_thumbnail(product.pixels, path)},
         {

@@ -24,7 +24,6 @@ from workers.contract.requests import ResolvedRerun
 from workers.lineage import Creation, lineage
 from workers.tasks.catalogue_workspace import CatalogueWorkspace, ResultRow
 from workers.tasks.results import report_result
-from workers.tasks.workspace import Result
 
 KIND = "rerun"
 SCHEMA = 1
@@ -49,8 +48,8 @@ class RerunWorkspace(CatalogueWorkspace):
     def has(self, result: ResultType, identity: str) -> bool:
         return identity not in self.hidden and super().has(result, identity)
 
-    def keep(self, result: Result) -> ResultRow:
-        self.rows.append(self.stored(result))
+    def add_row(self, row: Any) -> ResultRow:
+        self.rows.append(row)
         return self.rows[-1]
 
 

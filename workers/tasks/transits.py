@@ -35,8 +35,7 @@ def load_transit(
             )
         return workspace.built_psf(request.diffraction_recipe).kernel
 
-    with workspace.unpacked(request.transit_id) as (folder, images):
-        workspace.report("reading", 0, images)
+    with workspace.unpacked(request.transit_id) as folder:
         return read_prepared(
             folder,
             workspace.limits,

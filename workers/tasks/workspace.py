@@ -147,8 +147,8 @@ class Workspace(ABC):
         """The PSF of a recipe without its components; it is built if it does not exist."""
 
     @abstractmethod
-    def unpacked(self, transit_id: str) -> AbstractContextManager[tuple[Path, int]]:
-        """A folder with the files of a transit, and the number of its images. Raises DataError "no-such-transit"."""
+    def unpacked(self, transit_id: str) -> AbstractContextManager[Path]:
+        """A folder with the files of a transit. Begins the stage "reading". Raises DataError "no-such-transit"."""
 
     def inverter(self, request: ResolvedOnTransit) -> Inverter | None:
         """A function that gives the solution of the request's transit which an earlier job kept; None: it is
