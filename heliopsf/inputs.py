@@ -43,8 +43,7 @@ from psfcore.image import Image
 
 _EXPECTED = (
     "a sunpy Map, an NDData, CCDData or NDCube, an array, a pair (array, header), an HDU or HDUList, a path or the "
-    "bytes of a FITS "
-    "file, or a list of these"
+    "bytes of a FITS file, or a list of these"
 )
 _HDUS = (fits.PrimaryHDU, fits.ImageHDU, fits.CompImageHDU)
 _NO_VALUES = ("HISTORY", "KEYCOMMENTS", "COMMENT", "SIMPLE", "END", "")
@@ -290,8 +289,7 @@ def unit_text(unit: Any) -> str | None:
         raise DataError(
             "bad-unit",
             "expected pixels that are proportional to the light, such as DN or DN/s; got the logarithmic unit "
-            f"{unit}: convert "
-            "the pixels first",
+            f"{unit}: convert the pixels first",
         )
     pixel_free = unit * units.pix if units.pix in getattr(unit, "bases", ()) else unit
     for text, time in (("DN", units.dimensionless_unscaled), ("DN/s", units.s)):

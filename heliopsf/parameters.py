@@ -129,8 +129,7 @@ def noise_of(noise: object) -> Noise | None:
         raise DataError(
             "bad-noise",
             "noise: expected two numbers, photon gain (DN per photon) and read noise (DN rms), such as noise=(1.12, "
-            "1.15); got "
-            f"{noise!r:.80}",
+            f"1.15); got {noise!r:.80}",
         )
     gain = number("photon gain", noise[0], *COUNTS, *(one / units.ph for one in COUNTS))
     return Noise(gain, number("read noise", noise[1], *COUNTS))
@@ -149,8 +148,7 @@ def level_dn(level: object, header: Cards) -> float | None:
         if exposure_s is None:
             message = (
                 f"expected XPOSURE or EXPTIME in the header, because saturation_dn is in {level.unit}; got neither: "
-                "give "
-                "the level in DN"
+                "give the level in DN"
             )
             raise DataError("no-exposure", message)
         return number("saturation_dn", level, *rates) * exposure_s

@@ -113,8 +113,7 @@ def run_limited(
             raise DataError(
                 "unreadable-pixels",
                 f"expected readable pixels in {path.name}; reading {pixels} pixels crashed, or needed much more "
-                "memory or time than "
-                "they explain: copy or make the file again",
+                "memory or time than they explain: copy or make the file again",
             )
         if reply.get("ended") == LATE:
             raise OSError(

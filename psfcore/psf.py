@@ -152,9 +152,9 @@ def _check_core(kernel: Kernel) -> None:
         raise DataError(
             "psf-off-centre",
             "expected the core of the PSF at the centre of the pixel [ny // 2, nx // 2], within "
-            f"{LARGEST_OFFSET_PX:g} px; got "
-            f"it at x {offset_x_px:+.2f}, y {offset_y_px:+.2f} px from there, which would move every image by as much: "
-            "shift the PSF by whole and part pixels, for example with scipy.ndimage.shift",
+            f"{LARGEST_OFFSET_PX:g} px; got it at x {offset_x_px:+.2f}, y {offset_y_px:+.2f} px from there, which "
+            "would move every image by as much: shift the PSF by whole and part pixels, for example with "
+            "scipy.ndimage.shift",
         )
 
 

@@ -154,9 +154,8 @@ class PsfCache:
         if not self._ours():
             raise DataError(
                 "cache-of-another-user",
-                f"expected the folder {self.folder} to belong to you; it belongs to another user: name another folder "
-                "with "
-                "HELIOPSF_CACHE_DIR",
+                f"expected the folder {self.folder} to belong to you; it belongs to another user: name another "
+                "folder with HELIOPSF_CACHE_DIR",
             )
         if self.folder.stat().st_mode & _OTHERS:
             self.folder.chmod(0o700)

@@ -65,8 +65,7 @@ def with_scale(psf: Psf, plate_scale_arcsec: float | None) -> Psf:
         raise DataError(
             "plate-scale-known",
             f"expected a PSF without plate scale; PSF {psf.name} has {psf.plate_scale_arcsec:g} arcsec/px: leave the "
-            "plate scale "
-            "out",
+            "plate scale out",
         )
     return replace(psf, plate_scale_arcsec=plate_scale_arcsec)
 
@@ -123,8 +122,7 @@ def frame_warnings(psf: Psf, header: Cards) -> dict[str, str]:
     if not frame.flipped and abs(frame.turn_deg - psf.turn_deg) <= SILENT_DEG < abs(psf.turn_deg):
         warnings["frame"] = (
             f"the image is {how} against the detector and interpolated; the PSF was built at this angle: the image "
-            "before the "
-            "turn gives a better result"
+            "before the turn gives a better result"
         )
     elif psf.turn_deg:
         warnings["frame"] = (

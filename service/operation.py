@@ -51,8 +51,7 @@ class Readiness(BaseModel):
     status: str
     parts: dict[str, str] = Field(
         description="state of the database, of the storage, of the waiting jobs, and of the broker or embedded "
-        "worker; `ok`: the "
-        "part answers, and workers take the jobs"
+        "worker; `ok`: the part answers, and workers take the jobs"
     )
 
 

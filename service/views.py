@@ -47,15 +47,13 @@ class Progress(RowView):
     steps: int
     time_left_s: float | None = Field(
         description="estimated time until the last of `steps`, or until the end of a job that counts several times, "
-        "s; null: "
-        "unknown. The estimate uses the speed since the job began to count these steps, or the estimated time of the "
-        "job"
+        "s; null: unknown. The estimate uses the speed since the job began to count these steps, or the estimated "
+        "time of the job"
     )
     share: float | None = Field(
         None,
         description="share of the estimated time of a job that counts several times, 0 to 1; null: the steps count "
-        "the whole job, or "
-        "unknown",
+        "the whole job, or unknown",
     )
 
 

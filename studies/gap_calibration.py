@@ -34,9 +34,9 @@ from service.cli.transits import DIAGNOSE
 TRIED = (*np.linspace(0.3, 0.99, 70), 0.995)
 MISSED = 1.0  # the level of a case whose true cause is in no group
 HOLDS_FOR = (
-    "They are like these: 18 images of 256 px in three pointings, with one or two effects of the library, or with an "
-    "effect "
-    "that is not in the library, whose gap is detected. The author of the simulated effects did not use the library."
+    "They are like these: 18 images of 256 px in three pointings, with one or two effects of the library, or with "
+    "an effect that is not in the library, whose gap is detected. The author of the simulated effects did not use "
+    "the library."
 )
 
 

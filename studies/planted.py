@@ -88,7 +88,7 @@ FAULTS = (
     Fault("fits-size-limit-per-axis", "psfcore/fits/blocks.py",
           'if nx * ny > limits.max_pixels:', 'if max(nx, ny) > limits.max_pixels:'),
     Fault("diffraction-weights-of-lines-ignored", "psfcore/diffraction/combined.py",
-          'kernel = line.weight * kernel', 'kernel = kernel / len(lines)'),
+          'kernel = line.weight * one if len(lines) > 1 else one', 'kernel = one / len(lines)'),
     Fault("diffraction-mirror-path-not-doubled", "psfcore/diffraction/fresnel.py",
           '1j * sign * 4 * np.pi / grid.wavelength_mm', '1j * sign * 2 * np.pi / grid.wavelength_mm'),
     Fault("scatter-weight-by-sigma-not-variance", "psfcore/scatter/reconstruction.py",

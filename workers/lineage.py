@@ -109,8 +109,7 @@ def made_by(catalogue: Catalogue, row: ProductRow | PsfRow) -> ResolvedRerun:
         raise DataError(
             "parameters-unknown",
             f"expected the parameters that {row.id} was made with; these parameters were not recorded: submit a new "
-            "request "
-            "instead",
+            "request instead",
         )
     try:
         return _job_of(row, parameters)

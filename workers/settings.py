@@ -35,8 +35,7 @@ class Settings(BaseSettings):
     data_dir: Path = Field(
         default_factory=lambda: user_data_path("heliopsf", appauthor=False),
         description="folder of stored files and, by default, of the SQLite database; default: the user's data folder, "
-        "on Linux "
-        "`~/.local/share/heliopsf`",
+        "on Linux `~/.local/share/heliopsf`",
     )
     store_url: str | None = Field(
         None,
@@ -50,8 +49,7 @@ class Settings(BaseSettings):
         0,
         ge=0,
         description="largest size of an owner's stored files, MiB; 0: unlimited; `heliopsf store quota` sets another "
-        "limit for an "
-        "owner",
+        "limit for an owner",
     )
     keep_days: str = Field(
         "",
@@ -135,8 +133,7 @@ class Settings(BaseSettings):
         None,
         pattern=r"^https?://\S+$",
         description="address to which traces are sent by OTLP over HTTP, such as http://127.0.0.1:4318/v1/traces "
-        "(needs the extra "
-        "`traces`); default: no traces",
+        "(needs the extra `traces`); default: no traces",
     )
     log_format: Literal["text", "json"] | None = Field(
         None, description="format of the logs; default: text on a terminal, otherwise json"

@@ -103,8 +103,7 @@ def variant_for(cards: Mapping[str, Any], channels: Iterable[str]) -> str | None
         raise DataError(
             "several-variants-fit",
             "expected one variant of the channel that agrees with the filter and plate scale of the image; got "
-            f"{', '.join(best)}: "
-            "name the PSF in the request, or certify a PSF for a variant with both properties",
+            f"{', '.join(best)}: name the PSF in the request, or certify a PSF for a variant with both properties",
         )
     return best[0] if best else None
 

@@ -223,8 +223,7 @@ def _remember(blind_set: BlindSet, plan: SetPlan, scenes: Sequence[Plane]) -> No
             raise DataError(
                 "other-set",
                 f"expected an empty folder, or a set that was made with {about}; {blind_set.folder} contains a set "
-                "that "
-                f"was made with {before}. Choose another folder",
+                f"that was made with {before}. Choose another folder",
             )
     elif blind_set.folder.is_dir() and (
         others := {path.name for path in blind_set.folder.iterdir()} - {LOCK}

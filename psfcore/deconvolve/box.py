@@ -58,8 +58,7 @@ class Box:
             raise DataError(
                 "region-outside",
                 f"expected a region x0:x1,y0:y1 with 0 <= x0 < x1 <= {nx} and 0 <= y0 < y1 <= {ny}, the size of the "
-                "image; "
-                f"got {self}",
+                f"image; got {self}",
             )
         if min(self.shape) < SMALLEST_BOX_PX:
             raise DataError(
@@ -97,7 +96,6 @@ def region_without_errors(draws: int) -> DataError:
     """The error for a request for a region with an ERROR plane."""
     return DataError(
         "region-errors",
-        "expected error_draws 0 with a region, because the noise of the light that is subtracted would be missing in "
-        "the errors; "
-        f"got {draws}: leave it out, or deconvolve the whole image",
+        "expected error_draws 0 with a region, because the noise of the light that is subtracted would be missing "
+        f"in the errors; got {draws}: leave it out, or deconvolve the whole image",
     )

@@ -51,8 +51,7 @@ def input_warnings(psf: Psf, image: Image, method: str | None, *, other_channel:
     if _mesh_is_assumed(psf):
         warnings["assumed-mesh"] = (
             "the instrument file of the PSF assumes a part of its filter meshes: compare the arms of a bright point "
-            "with it "
-            "(heliopsf arms), or use a published PSF"
+            "with it (heliopsf arms), or use a published PSF"
         )
     warnings |= image.warnings
     if image.saturation is not None and image.saturation.warning is not None:
@@ -77,8 +76,8 @@ def _cut_warning(psf: Psf, image: Image) -> dict[str, str]:
     (ny, nx), (rows, columns) = psf.kernel.shape, needed.shape
     return {
         "psf-cut": f"of the PSF of {nx} x {ny} px, the image needs {columns} x {rows} px: {100 * off:.3g} % of its "
-        "light falls "
-        "farther, and such light from sources beyond the image is not removed: use a larger image if it matters"
+        "light falls farther, and such light from sources beyond the image is not removed: use a larger image if it "
+        "matters"
     }
 
 
@@ -117,8 +116,7 @@ def pixel_warnings(image: Image, psf_kernel: NDArray[np.float64]) -> dict[str, s
     if spikes >= FEWEST_SPIKES:
         warnings["spikes"] = (
             f"at least {spikes} pixels are brighter than the PSF allows, as cosmic rays are, and spread: use the "
-            "image after "
-            "despiking, or mask them"
+            "image after despiking, or mask them"
         )
     sample = image.pixels[image.valid]
     sample = sample[:: max(1, sample.size // _SAMPLE)]
@@ -128,8 +126,7 @@ def pixel_warnings(image: Image, psf_kernel: NDArray[np.float64]) -> dict[str, s
         if count and low > SMALLEST_BIAS_DN and high - low < low:
             warnings["bias"] = (
                 f"the darkest pixels are at {low:.4g}, and the others reach to {high:.4g}: if a bias is still in the "
-                "image, subtract "
-                "it first"
+                "image, subtract it first"
             )
         whole = np.array_equal(sample, np.rint(sample))
         if whole and 200 < float(image.pixels.max(where=image.valid, initial=0)) <= 255 and low >= 0:

@@ -109,9 +109,8 @@ def check_memory(image: Shape, needed_bytes: float, free_bytes: int) -> None:
     raise DataError(
         "too-much-memory",
         f"expected a deconvolution that fits into the free memory, {free_bytes / MIB:.0f} MiB; an image of {nx} x "
-        f"{ny} px "
-        f"needs about {needed_bytes / MIB:.0f} MiB: deconvolve a part of the image "
-        "(--region, in Python region=), end other programs, or use a machine with more memory",
+        f"{ny} px needs about {needed_bytes / MIB:.0f} MiB: deconvolve a part of the image (--region, in Python "
+        "region=), end other programs, or use a machine with more memory",
         {"needed_mib": round(needed_bytes / MIB), "free_mib": round(free_bytes / MIB)},
     )
 

@@ -427,8 +427,7 @@ def deconvolution_history(product: Product, psf: UsedPsf) -> list[str]:
             if box is None
             else [
                 f"box {box.box} of the input alone, with a rim of {box.rim_px} px: differs from the same box of the "
-                "whole "
-                f"image by at most {box.error:.3g} (estimated bound, in the unit of the image)"
+                f"whole image by at most {box.error:.3g} (estimated bound, in the unit of the image)"
             ]
         ),
         *([] if product.noise is None or product.noise.source == "given" else [f"noise: {product.noise}"]),

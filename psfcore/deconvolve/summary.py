@@ -18,8 +18,7 @@ def summary_lines(details: Mapping[str, Any]) -> list[str]:
     if region is not None:
         lines.append(
             f"region {region['box']}, rim {region['rim_px']} px: differs from the same pixels of the whole image by "
-            "at most "
-            f"{region['error']:.3g} (estimated bound, in the unit of the image)"
+            f"at most {region['error']:.3g} (estimated bound, in the unit of the image)"
         )
     if noise is not None:
         lines.append(f"errors from the noise: {noise['text']}")

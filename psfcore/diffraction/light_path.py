@@ -330,8 +330,7 @@ def _sharpest(waves: Waves, at_primary: Wave, paraxial_mm: float) -> float:
         raise DataError(
             "no-focus",
             f"expected best focus within {SEARCH_MM} mm of the paraxial separation {paraxial_mm:.3f} mm; got no "
-            "maximum "
-            "there: correct the radii or distances of the mirrors in the instrument file",
+            "maximum there: correct the radii or distances of the mirrors in the instrument file",
         )
     return separation_mm
 

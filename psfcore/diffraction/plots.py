@@ -41,9 +41,8 @@ def fresnel_png(study: FresnelStudy, path: str | Path) -> None:
     focus = study.focus
     below = (
         f"best focus: mirror separation {focus.separation_mm:.2f} mm ({focus.shift_mm:+.2f} mm from the printed "
-        "value), "
-        f"focal length {focus.focal_length_mm:.0f} mm; mean of {study.phases} mesh phases; "
-        f"series of {study.windows} windows"
+        f"value), focal length {focus.focal_length_mm:.0f} mm; mean of {study.phases} mesh phases; series of "
+        f"{study.windows} windows"
     )
     figure.suptitle(f"{heading}\n{below}", fontsize=11.5, color=_INK, x=0.01, ha="left")
     centre_axes, curve_axes, distance_axes = figure.subplots(1, 3)

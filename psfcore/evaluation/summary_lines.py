@@ -39,9 +39,8 @@ def _pointing(of: Json) -> str:
     centre = "" if of["centre_mean_pct"] is None else f"; centre {of['centre_mean_pct']:+.2f} %"
     return (
         f"{name}: {of['images']} images, mean {_number(of['mean_pct'], '+')} % (noise "
-        f"{_number(of['mean_noise_pct'])}), "
-        f"rms {_number(of['rms_pct'])} % (noise {_number(of['noise_pct'])}), largest {_number(of['largest_pct'])} "
-        f"%{centre}"
+        f"{_number(of['mean_noise_pct'])}), rms {_number(of['rms_pct'])} % (noise {_number(of['noise_pct'])}), "
+        f"largest {_number(of['largest_pct'])} %{centre}"
     )
 
 

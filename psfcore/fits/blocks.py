@@ -193,8 +193,7 @@ def walk(source: Source, limits: FitsLimits) -> Iterator[Hdu]:
             number < limits.max_hdus,
             "too-many-hdus",
             f"expected at most {limits.max_hdus} HDUs, and an image in one of them; got more HDUs: write the image "
-            "into a "
-            "file of its own",
+            "into a file of its own",
         )
         header_bytes += len(raw)
         # With another value astropy calls the HDU corrupted, and then reads on without an end.
@@ -247,9 +246,9 @@ def _no_image(kinds: list[str]) -> HeaderError:
         first = ", ".join("0" * (axes - 2)) if axes < _MANY_AXES else "..."
         return HeaderError(
             "three-axes" if axes == 3 else "not-2d",
-            f"{expected}; got an image of {axes} axes in HDU {hdu}: name another HDU (--hdu), or write one plane, for "
-            "example with astropy: "
-            f"hdus = fits.open('FILE'); hdus[{hdu}].data = hdus[{hdu}].data[{first}]; hdus.writeto('NEW')",
+            f"{expected}; got an image of {axes} axes in HDU {hdu}: name another HDU (--hdu), or write one plane, "
+            f"for example with astropy: hdus = fits.open('FILE'); hdus[{hdu}].data = hdus[{hdu}].data[{first}]; "
+            "hdus.writeto('NEW')",
         )
     if "line" in kinds:
         return HeaderError("not-2d", f"{expected}; got an image of one axis: store the image with two axes")
@@ -284,8 +283,7 @@ def _read_header(source: Source, most: int, limits: FitsLimits, *, first: bool) 
     raise HeaderError(
         "header-too-long",
         f"expected at most {limits.max_header_bytes} bytes of headers, each with an END card; got more: write the "
-        "image "
-        "into a file of its own, with fewer cards",
+        "image into a file of its own, with fewer cards",
     )
 
 

@@ -110,9 +110,8 @@ def _with_planes(
         )
     if stored.damaged:
         warnings["damaged"] = (
-            f"DATASUM of HDU {stored.number} does not agree with its pixels: the file was damaged or changed after it "
-            "was written; "
-            "copy it again"
+            f"DATASUM of HDU {stored.number} does not agree with its pixels: the file was damaged or changed after "
+            "it was written; copy it again"
         )
     return image.warned(warnings) if warnings else image
 
@@ -148,8 +147,7 @@ def check_exposure_of_sun(header: Header) -> None:
             raise DataError(
                 "not-an-exposure",
                 f"expected an exposure of the Sun; the header says {key} = {kind!r:.40}: use another image, or allow "
-                "it to be "
-                "deconvolved (--again, in a request again = true)",
+                "it to be deconvolved (--again, in a request again = true)",
             )
     check_linear(header)
 

@@ -145,8 +145,7 @@ def _rate_or_counts(image: Image, level: Saturation, scale: float | None) -> Sat
     return replace(
         level,
         warning=f"no pixel reaches the saturation level {level.found} = {level.level:g}, but {there} pixels do if it "
-        "is in DN of one exposure: "
-        f"if it is, {_SETTING}",
+        f"is in DN of one exposure: if it is, {_SETTING}",
     )
 
 
@@ -183,8 +182,7 @@ def _counted(image: Image, level: Saturation) -> Saturation:
             float(np.partition(values, -counted)[-counted]) if counted else None,
             card,
             f"{above} pixels are above the saturation level {level.level:g}, but {card} counts {counted} saturated "
-            "pixels: the values "
-            "were changed after they were counted; "
+            "pixels: the values were changed after they were counted; "
             f"{f'about {counted} of the brightest are' if counted else 'none of them is'} masked: if this is wrong, "
             f"{_SETTING}",
         )
@@ -192,8 +190,7 @@ def _counted(image: Image, level: Saturation) -> Saturation:
         return replace(
             level,
             warning=f"NSATPIX counts {counted} saturated pixels, but no pixel is at {AIA_LEVEL_DN:g} DN or above: the "
-            "image "
-            f"was cut or its values were changed; saturated pixels that are left are not masked: {_SETTING}",
+            f"image was cut or its values were changed; saturated pixels that are left are not masked: {_SETTING}",
         )
     return level
 

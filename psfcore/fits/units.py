@@ -85,8 +85,7 @@ def check_linear(header: Cards) -> None:
         raise DataError(
             "bad-unit",
             f"expected pixels that are proportional to the light, such as DN or DN/s; got the unit {text:.40}: "
-            "convert the "
-            "pixels first",
+            "convert the pixels first",
         )
 
 

@@ -78,8 +78,7 @@ def _same_unit(flaring: Image, before: Image) -> tuple[Plane, Plane, str]:
         raise DataError(
             "flare-shapes",
             f"expected two images of the same shape; got {flaring.pixels.shape} and {before.pixels.shape}: cut both "
-            "to the "
-            "same field",
+            "to the same field",
         )
     rates = [_rate(image) for image in (flaring, before)]
     if flaring.exposure_s is None and before.exposure_s is None and flaring.unit == before.unit:
@@ -88,8 +87,7 @@ def _same_unit(flaring: Image, before: Image) -> tuple[Plane, Plane, str]:
         raise DataError(
             "flare-units",
             f"expected the exposure time of both images or of neither; got {flaring.exposure_s} and "
-            f"{before.exposure_s} s: "
-            "add XPOSURE to the header without it",
+            f"{before.exposure_s} s: add XPOSURE to the header without it",
         )
     else:
         unit = rate_label(flaring)

@@ -407,7 +407,6 @@ def caution_of_closure(label: str, gap_pct: float, error_pct: float) -> tuple[st
         return ()
     return (
         f"The closure by {label} says little: without the held-out images, its parameters are so uncertain that they "
-        "predict the "
-        f"discs of these images only to {error_pct:.1f} %, and the gap is {gap_pct:.1f} %. More images, or longer "
-        "exposures, would help.",
+        f"predict the discs of these images only to {error_pct:.1f} %, and the gap is {gap_pct:.1f} %. More images, "
+        "or longer exposures, would help.",
     )

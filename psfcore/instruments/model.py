@@ -134,8 +134,7 @@ class Aperture:
         if self.sector is not None or self.obscuration_diameter_mm:
             raise ValueError(
                 "expected corners_mm alone, or a disc or ring with or without a sector; got corners_mm with another "
-                "shape: "
-                "describe opaque parts of a polygon in [mount]"
+                "shape: describe opaque parts of a polygon in [mount]"
             )
         farthest = max(math.hypot(x, y) for x, y in self.corners_mm)
         if farthest > self.diameter_mm / 2 * (1 + 1e-9):

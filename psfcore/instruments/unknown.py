@@ -19,8 +19,7 @@ WAYS = (
     {
         "way": "name",
         "text": "name a PSF: psf_id in the request, --psf ID on the command line; `heliopsf psf build --instrument "
-        "NAME -o "
-        "PSF.fits` makes the PSF of an instrument above, and prints its id",
+        "NAME -o PSF.fits` makes the PSF of an instrument above, and prints its id",
     },
     {
         "way": "upload",
@@ -89,8 +88,7 @@ TELESCOPES = (
         reason=_NO_SOURCE,
         ways={
             "upload": "We found no file of its PSF. SolarSoft's eit_degrid removes the shadow of the grid near the "
-            "detector: "
-            "use it first, and then a PSF of your own"
+            "detector: use it first, and then a PSF of your own"
         },
         angstrom=(171.0, 195.0, 284.0, 304.0),
     ),
@@ -115,13 +113,10 @@ TELESCOPES = (
         "incidence",
         ways={
             "upload": "SolarSoft has PSFs of XRT as FITS images in hinode/xrt/idl/util: "
-            "XRT20170324_151721.0.PSF560.fits at "
-            "560 eV and XRT20170324_161721.0.PSF1000.fits at 1 keV; `heliopsf psf get xrt_560ev_2017` or "
-            "xrt_1kev_2017 brings the "
-            "PSF whose energy suits the filters of the image",
+            "XRT20170324_151721.0.PSF560.fits at 560 eV and XRT20170324_161721.0.PSF1000.fits at 1 keV; `heliopsf "
+            "psf get xrt_560ev_2017` or xrt_1kev_2017 brings the PSF whose energy suits the filters of the image",
             "fit": "In images of the transit of Venus of 2012, the PSF at 560 eV removes 5 % of the light in the disc "
-            "of Venus; "
-            "heliopsf can fit the remaining scatter to these images",
+            "of Venus; heliopsf can fit the remaining scatter to these images",
         },
     ),
     Telescope(
@@ -146,8 +141,7 @@ TELESCOPES = (
         reason="the sources of the AIA files describe the seven EUV channels alone",
         ways={
             "fit": "AIA observed the transit of Venus of 2012, for example at 1600 angstrom; heliopsf can fit the "
-            "scatter to "
-            "such images"
+            "scatter to such images"
         },
         angstrom=(1600.0, 1700.0, 4500.0),
     ),
@@ -224,9 +218,8 @@ def _lacking(named: str, instruments: Sequence[Mapping[str, Any]], header: Mappi
     cards = header.get("cards", {})  # only summaries of files have them
     given = "".join(f"; got {key} = {cards[key]!r:.40}" for key in ("WAVELNTH", "WAVEUNIT") if key in cards)
     return (
-        "its header gives no wavelength that can be read: expected a number in the card WAVELNTH, and its unit, such "
-        "as "
-        f"angstrom or nm, in WAVEUNIT{given}"
+        "its header gives no wavelength that can be read: expected a number in the card WAVELNTH, and its unit, "
+        f"such as angstrom or nm, in WAVEUNIT{given}"
     )
 
 

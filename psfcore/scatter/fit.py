@@ -334,8 +334,8 @@ def _limits(solution: Solution, curve: Curve, factor: float) -> tuple[str, ...]:
     if solution.optics.least_transfer < LEAST_TRANSFER:
         out.append(
             "the diffraction PSF blurs so much that the images do not contain the finest structures: in simulations "
-            "with such "
-            f"PSFs, the fraction of scattered light was wrong by up to {BIAS_OF_BROAD_CORES_POINTS:g} percentage points"
+            f"with such PSFs, the fraction of scattered light was wrong by up to {BIAS_OF_BROAD_CORES_POINTS:g} "
+            "percentage points"
         )
     short = min(solution.transit.shape)
     if short < REACH_GRID_PX:

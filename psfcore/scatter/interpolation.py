@@ -94,9 +94,8 @@ def interpolated_shape(before: FittedShape, after: FittedShape, weight: float) -
         raise DataError(
             "shapes-differ",
             f"expected two PSFs that were fitted with the same shape; got {before.shape} "
-            f"({', '.join(before.parameters)}) "
-            f"and {after.shape} ({', '.join(after.parameters)}): fit both transits with the same shape "
-            "(`heliopsf psf fit --shape`)",
+            f"({', '.join(before.parameters)}) and {after.shape} ({', '.join(after.parameters)}): fit both transits "
+            "with the same shape (`heliopsf psf fit --shape`)",
         )
     q0, q1 = np.array(before.coordinates), np.array(after.coordinates)
     c0, c1 = np.array(before.covariance), np.array(after.covariance)
@@ -226,9 +225,8 @@ def _check_same_telescope(before: Psf, after: Psf) -> None:
     if differ or before.kernel.shape[0] != before.kernel.shape[1]:
         raise DataError(
             "psfs-differ",
-            "expected two PSFs of the same instrument, channel, filter and plate scale, on square arrays of the same "
-            "size; got "
-            f"{'; '.join(differ) or f'arrays of {before.kernel.shape}'}: choose two PSFs of one series",
+            "expected two PSFs of the same instrument, channel, filter and plate scale, on square arrays of the "
+            f"same size; got {'; '.join(differ) or f'arrays of {before.kernel.shape}'}: choose two PSFs of one series",
         )
 
 
@@ -246,8 +244,7 @@ def _check_same_diffraction(before: Psf, after: Psf) -> None:
             "diffraction-differs",
             f"expected two PSFs with the same diffraction PSF; got {before.name} {before.version} and {after.name} "
             f"{after.version}, whose diffraction differs by {100 * moved:.3g} % of the light: fit both transits with "
-            "the same "
-            "diffraction PSF",
+            "the same diffraction PSF",
         )
 
 
@@ -257,8 +254,6 @@ def _check_of_its_shape(psf: Psf, model: Kernel) -> None:
         raise DataError(
             "psf-not-of-its-shape",
             f"expected a PSF that is its fitted shape convolved with its diffraction PSF; got {psf.name} "
-            f"{psf.version}, which "
-            f"differs from that by {100 * moved:.3g} % of the light, for example because it contains a corrected "
-            "effect: "
-            "name a PSF for the image instead (--psf)",
+            f"{psf.version}, which differs from that by {100 * moved:.3g} % of the light, for example because it "
+            "contains a corrected effect: name a PSF for the image instead (--psf)",
         )

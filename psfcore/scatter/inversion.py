@@ -429,6 +429,5 @@ def _check_determined(normal: Matrix, shape: Shape) -> None:
         raise DataError(
             "transit-says-too-little",
             f"expected frames that determine {', '.join(shape.names)}; got frames that leave a combination of them "
-            "undetermined; "
-            "add images at other distances from the limb, or fit a shape with fewer parameters",
+            "undetermined; add images at other distances from the limb, or fit a shape with fewer parameters",
         )

@@ -80,8 +80,7 @@ class Parameter:
             raise DataError(
                 "transit-says-too-little",
                 f"expected images that determine {self.name}; the fit left the range of its values: add images, or "
-                "fit a shape "
-                "with fewer parameters",
+                "fit a shape with fewer parameters",
             )
         if self.scale == "log":
             return math.exp(coordinate)

@@ -179,8 +179,7 @@ def _size_of_manifest(content: Mapping[str, Any]) -> int:
     if not isinstance(size, int) or isinstance(size, bool):
         raise _bad(
             f"{MANIFEST_NAME}: expected the images in the folder or, without them, `size_px` (their width and height "
-            "in px); "
-            f"got {size!r:.60}"
+            f"in px); got {size!r:.60}"
         )
     return size
 

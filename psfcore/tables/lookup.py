@@ -221,8 +221,7 @@ def _resolution(tables: Tables) -> str:
         return f"{near}; elsewhere interpolated linearly, with an error below {NEGLIGIBLE_POINTS} points"
     return (
         f"{near}; elsewhere interpolated linearly (steps of 1 px up to {WHOLE_TO_PX} px, 2 % farther out), with an "
-        "error "
-        f"of up to {worst:.2f} points ({100 * tables['interpolation_error'][TOTAL]:.2f} for the total PSF)"
+        f"error of up to {worst:.2f} points ({100 * tables['interpolation_error'][TOTAL]:.2f} for the total PSF)"
     )
 
 

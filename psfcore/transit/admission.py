@@ -89,8 +89,7 @@ class Gate:
         if self._declared_bytes > self.limits.max_bytes:
             message = (
                 f"expected an archive that unpacks to at most {self.limits.max_bytes} bytes; got more: pack fewer or "
-                "smaller "
-                "images"
+                "smaller images"
             )
             raise DataError("archive-too-large", message)
 

@@ -138,8 +138,7 @@ def first_guess(transit: Transit) -> FirstGuess:
     if not telling:
         message = (
             "expected at least one image that shows the centre of the occulter in front of the Sun; got none: check "
-            "the "
-            "positions in transit.json"
+            "the positions in transit.json"
         )
         raise DataError("no-first-guess", message)
     best = min(telling, key=lambda guess: guess.inhomogeneity)

@@ -141,8 +141,7 @@ def get_product_thumbnail(product_id: Identity, request: Request, caller: Readin
     missing = (
         "no-thumbnail",
         "expected a product with a thumbnail; this one was made before products had one: use its preview, or delete "
-        "the "
-        "product and submit the job again",
+        "the product and submit the job again",
     )
     return files.send(request, state.store, digest, "image/png", None, missing=missing)
 

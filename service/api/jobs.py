@@ -45,8 +45,7 @@ class EstimateView(BaseModel):
     parameters: dict[str, Any] = Field(description="the parameters, with every default and the PSF filled in")
     result_id: str = Field(
         description="id that the result has, or would have; for a kind whose jobs always make a new result (`rerun`), "
-        "this id is "
-        "different each time"
+        "this id is different each time"
     )
     existing: str | None = Field(
         description="address of the result, if it is in the catalogue already; otherwise null"
@@ -189,8 +188,7 @@ def check_own(row: JobRow) -> JobRow:
             409,
             "job-of-bulk",
             f"expected a job that was submitted; job {row.id} is a part of bulk run {bulk_id}: pause or cancel the "
-            "bulk run "
-            f"(POST /v1/bulk/{bulk_id}/pause or /cancel)",
+            f"bulk run (POST /v1/bulk/{bulk_id}/pause or /cancel)",
         )
     return row
 

@@ -141,9 +141,8 @@ def make_key(body: NewKey, response: Response, caller: Submitting, state: Shared
         raise Problem(
             409,
             "too-many-keys",
-            f"expected at most {MOST_KEYS} valid keys of an owner; {owner} already has that number: revoke a key that "
-            "is "
-            "not used",
+            f"expected at most {MOST_KEYS} valid keys of an owner; {owner} already has that number: revoke a key "
+            "that is not used",
         ) from error
     row = state.catalogue.keys.get(key.split("_")[1])
     assert row is not None
@@ -222,8 +221,7 @@ def _check_scopes(caller: Caller, scopes: Iterable[Scope], advice: str) -> None:
             403,
             "scope-missing",
             f"expected scopes of your own key ({', '.join(sorted(caller.scopes))}); got also "
-            f"{', '.join(sorted(lacking))}: "
-            f"{advice}",
+            f"{', '.join(sorted(lacking))}: {advice}",
         )
 
 
@@ -246,7 +244,6 @@ def _end(state: Shared, caller: Caller, body: NewKey) -> float | None:
             403,
             "outlives-its-maker",
             f"expected an end that is not later than that of your own key ({latest:.0f}); got {end:.0f}: choose an "
-            "earlier end, "
-            "or ask the operator for a key",
+            "earlier end, or ask the operator for a key",
         )
     return latest if end is None else end

@@ -60,8 +60,8 @@ class Part:
             ge=1,
             le=LARGEST,
             description="n: each number of the answer stands for a block of n x n pixels. The number is the mean of "
-            "the finite "
-            "pixels; for `quality`, the bitwise OR. Blocks at the last rows and columns of the window may be smaller",
+            "the finite pixels; for `quality`, the bitwise OR. Blocks at the last rows and columns of the window "
+            "may be smaller",
         ),
     ] = 1
 

@@ -274,8 +274,7 @@ def _not_open(upload_id: str) -> Problem:
         404,
         "no-such-upload",
         f"expected the id of an open upload; got {upload_id}, which was completed, deleted or has expired: begin the "
-        "upload "
-        "again",
+        "upload again",
     )
 
 

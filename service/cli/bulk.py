@@ -151,8 +151,7 @@ def list_bulks(service: Client, most: int) -> None:
     def line(row: Row) -> str:
         return (
             f"{short(row['id'])}  {row['phase']:<9}  {moment(row['created_at'])}  {row['done']} of "
-            f"{_total(row, row['total'])} done, "
-            f"{row['failed']} failed  {row['name']}"
+            f"{_total(row, row['total'])} done, {row['failed']} failed  {row['name']}"
         )
 
     print_rows(

@@ -76,9 +76,7 @@ class PsfFile(ImageFile):
     version: str
 
     def seen_as(self, psf: Psf) -> Psf:
-        """The PSF with the name, the version, the instrument and the wavelength that an upload would get from the
-        header.
-        """
+        """The PSF with the name, the instrument and the wavelength that an upload would get from the header."""
         instrument = psf.instrument or instrument_of(asdict(self.summary))
         channel = channel_of(instrument, self.summary.wavelnth) or ""
         angstrom = psf.wavelength_angstrom

@@ -177,8 +177,7 @@ def collect_command(
     if catalogue.schema.status().state != "current":
         raise click.ClickException(
             "the database is not at the revision of this version, so this command may not find all references to "
-            "files; see "
-            "`heliopsf database status`"
+            "files; see `heliopsf database status`"
         )
     result = collect(catalogue, open_store(settings), older_than_s, dry_run=dry_run, even_most=even_most)
     if dry_run:

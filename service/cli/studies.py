@@ -89,8 +89,8 @@ def fresnel(
     focus = study.focus
     echo(
         f"best focus: mirrors {focus.separation_mm:.3f} mm apart, {focus.shift_mm:+.3f} mm from the distance in the "
-        "drawing "
-        f"(the drawing gives a blur of {focus.printed_blur_px:.0f} px); focal length {focus.focal_length_mm:.1f} mm"
+        f"drawing (the drawing gives a blur of {focus.printed_blur_px:.0f} px); focal length "
+        f"{focus.focal_length_mm:.1f} mm"
     )
     echo("distance (mm)   largest difference, mean over phases   single phases")
     for at in study.distances:

@@ -135,8 +135,7 @@ class _DiagnosisByDefault(click.Group):
 @click.group(
     cls=_DiagnosisByDefault,
     help="Find out why a fitted PSF and a transit differ. `heliopsf gap TRANSIT` is short for `heliopsf gap diagnose "
-    "TRANSIT`. "
-    "`heliopsf gap diagnose -h` lists its options.",
+    "TRANSIT`. `heliopsf gap diagnose -h` lists its options.",
     short_help="Find why a fitted PSF and a transit differ.",
 )
 def gap() -> None:
@@ -265,8 +264,7 @@ def _lines(report: dict[str, Any]) -> list[str]:
     type=click.FloatRange(0.05, 50),
     metavar="PCT",
     help="Residual in the discs, percent, that remains when the PSF is fitted to images with the effect; repeat to "
-    "vary it "
-    "[default: random, 0.5 to 10]",
+    "vary it [default: random, 0.5 to 10]",
 )
 @click.option("--clean-only", is_flag=True, help="Make only cases without an effect, to count false alarms")
 @click.option(

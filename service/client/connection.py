@@ -316,8 +316,7 @@ def _check_digest(response: httpx.Response, received: bytes) -> None:
     if digest is not None and digest[1] != base64.b64encode(received).decode():
         raise ServiceError(
             f"expected a file with the SHA-256 {base64.b64decode(digest[1]).hex()}; received one with "
-            f"{received.hex()}: try "
-            "again; if this does not help, the file in the store is damaged: tell the operator",
+            f"{received.hex()}: try again; if this does not help, the file in the store is damaged: tell the operator",
             code="download-damaged",
         )
 

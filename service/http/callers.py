@@ -221,10 +221,9 @@ def _check_form_token(request: Request, session: SessionRow, sent: str) -> None:
         raise Problem(
             403,
             "form-token-missing",
-            f"expected the form token of your session in the field form_token or the header {FORM_TOKEN}, because the "
-            "request "
-            "does not say from which site it comes; got none or another one: load the page again, and send the form "
-            "from there",
+            f"expected the form token of your session in the field form_token or the header {FORM_TOKEN}, because "
+            "the request does not say from which site it comes; got none or another one: load the page again, and "
+            "send the form from there",
         )
 
 

@@ -314,8 +314,7 @@ def _advising(request: Request) -> Iterator[None]:
             raise
         advice = (
             f"the body was sent as {URL_ENCODED}, as curl -d does, which removes zeros and line ends from a file: "
-            "send it "
-            "with curl -F file=@FILE or curl --data-binary @FILE"
+            "send it with curl -F file=@FILE or curl --data-binary @FILE"
         )
         raise Problem(error.status, error.code, f"{error.detail}; {advice}", **error.more) from error
 

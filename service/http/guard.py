@@ -164,9 +164,8 @@ class _Guard:
             raise Problem(
                 413,
                 "too-large",
-                f"expected a request of at most {most} bytes; got more: send less in one request, or ask the operator "
-                "to raise "
-                f"{setting}",
+                f"expected a request of at most {most} bytes; got more: send less in one request, or ask the "
+                f"operator to raise {setting}",
             )
 
         return limited
@@ -236,8 +235,7 @@ def _check_origin(method: str, headers: Headers) -> None:
             403,
             "cross-site",
             "expected a request from a program or from a page of this service; got a request from a page of another "
-            "site: "
-            "open the page of this service in the browser, and send the form there",
+            "site: open the page of this service in the browser, and send the form there",
         )
 
 
@@ -276,8 +274,7 @@ def _keep_own_cookie(scope: Scope, headers: Headers) -> None:
             431,
             "cookies-too-long",
             f"expected at most {COOKIE_BYTES} bytes of cookies; got more: delete the cookies of this site in the "
-            "browser, or "
-            "send none with a key",
+            "browser, or send none with a key",
         )
     own = re.search(rf"(?:^|;) *({cookie_name(scope['scheme'])}=[\w-]+) *(?:;|$)", ";".join(sent), re.ASCII)
     if own is not None:

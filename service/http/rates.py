@@ -140,8 +140,7 @@ class AtOnce:
                     429,
                     self._code,
                     f"expected at most {self._most} {self._what} of one caller at the same time; got one more: wait "
-                    "until "
-                    "one of them has ended",
+                    "until one of them has ended",
                     headers={"Retry-After": "1"},
                 )
             self._open[who] += 1

@@ -64,8 +64,7 @@ SURE = "If you are sure, allow it below."
 # Swagger UI loads its icons from data: addresses in its style sheet, and its scripts set styles.
 REFERENCE_HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src "
-    "'self' data:; "
-    "connect-src 'self'; frame-ancestors 'none'; base-uri 'none'",
+    "'self' data:; connect-src 'self'; frame-ancestors 'none'; base-uri 'none'",
     "Referrer-Policy": "no-referrer",
 }
 START, OPEN, CHECK = "Start", "Open the product", "Check and start"

@@ -26,8 +26,7 @@ SHOWN = 120
 # What to do instead of sending a file with a job (DALI's UPLOAD).
 UPLOAD_FIRST = (
     "upload each input of a job first, by POST /v1/images, /v1/psfs or /v1/transits, and send its id in the field "
-    "image_id, mask_id, "
-    "psf_id or transit_id"
+    "image_id, mask_id, psf_id or transit_id"
 )
 # Characters that XML 1.0 cannot contain.
 NO_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
@@ -169,8 +168,7 @@ PLAIN_ERRORS: dict[str | int, dict[str, Any]] = {
     "4XX": {
         "content": {"text/plain": {}, "application/problem+json": {}},
         "description": "What was expected, what was received, and what to do next; as problem details if the request "
-        "is not "
-        "permitted from its origin or under this host name.",
+        "is not permitted from its origin or under this host name.",
     }
 }
 

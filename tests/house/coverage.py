@@ -37,7 +37,7 @@ def table(counts: dict[str, tuple[int, int]]) -> str:
 def main(page: Path) -> None:
     """Write the table of the last `make coverage` into a page."""
     data = Coverage()
-    data.combine()
+    data.load()
     text = Path(".coverage.json")
     data.json_report(outfile=str(text))
     counts = rooms(json.loads(text.read_text())["files"])

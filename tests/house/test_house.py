@@ -20,6 +20,7 @@ from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 
 from service.openapi import description
+from studies.planted import FAULTS
 from tests.conftest import pytest_collection_modifyitems
 
 HERE = Path(__file__).parents[2]
@@ -443,3 +444,7 @@ def test_tests_of_one_id_are_refused(request: pytest.FixtureRequest) -> None:
     pytest_collection_modifyitems(request.config, [request.node])
     with pytest.raises(pytest.UsageError, match="test_tests_of_one_id_are_refused"):
         pytest_collection_modifyitems(request.config, [request.node, request.node])
+
+
+def test_every_planted_fault_fits_the_code() -> None:
+    assert [(fault.name, said) for fault in FAULTS if (said := fault.problem(HERE))] == []

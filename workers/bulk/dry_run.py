@@ -57,8 +57,7 @@ class BulkEstimate(BaseModel):
     images: int = Field(description="images that were found")
     complete: bool = Field(
         description=f"false: {BUDGET_S:g} s were not enough to list all files and to examine the sample, so the run "
-        "may have more images "
-        "than are counted here, or the sample fewer than were asked for",
+        "may have more images than are counted here, or the sample fewer than were asked for",
     )
     examined: int = Field(description="images of the sample whose headers were read")
     refused_images: int = Field(description="examined images that the run would refuse")
@@ -74,8 +73,7 @@ class BulkEstimate(BaseModel):
     memory_mib: int = Field(description="memory that the largest examined image needs")
     example_output: str | None = Field(
         description="path of the product of an examined image in the output folder; null: there is no output folder, "
-        "or the "
-        "path has the id of the product, which is not known before the run",
+        "or the path has the id of the product, which is not known before the run",
     )
 
 
@@ -208,8 +206,7 @@ class _DryRun:
             raise DataError(
                 "output-name-taken",
                 f"expected a name of its own for each product; got {archive_files.shown(target)}, which is also the "
-                "name for "
-                f"{first}: use a layout with further fields, for example {{product}}",
+                f"name for {first}: use a layout with further fields, for example {{product}}",
             )
         return target
 

@@ -138,8 +138,7 @@ class Bulks(Queries):
                 raise DataError(
                     "equal-bulk-open",
                     f"expected no other open bulk run of the same request; run {equal.id} is {equal.phase}: cancel "
-                    "that run, "
-                    "or try again when it has ended",
+                    "that run, or try again when it has ended",
                 )
             bulk.phase, bulk.ended_at, bulk.running_since = BulkPhase.RUNNING, None, time.time()
             return changed

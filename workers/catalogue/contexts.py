@@ -111,8 +111,7 @@ class Series(Queries):
                 raise DataError(
                     "series-not-total",
                     f"expected a series of total PSFs (instrument/channel/{TOTAL}), because images are deconvolved "
-                    "with these; "
-                    f"got {series}: name the series of the total PSFs",
+                    f"with these; got {series}: name the series of the total PSFs",
                 )
             if may_interpolate(session, series, owner) == interpolated:
                 return
@@ -164,8 +163,7 @@ def _check_known(session: Session, series: str, owner: str) -> None:
         raise DataError(
             "no-such-series",
             f"expected a series of which a PSF was certified, as instrument/channel/kind; got {series!r:.140}: list "
-            "the series "
-            "with `heliopsf psf series`, or certify a PSF first",
+            "the series with `heliopsf psf series`, or certify a PSF first",
         )
 
 
@@ -189,8 +187,7 @@ class Contexts(Queries):
             raise DataError(
                 "bad-name",
                 "expected a name of up to 63 letters, digits, full stops, underscores and hyphens, other than "
-                f"{' and '.join(RESERVED)}; got "
-                f"{ascii(name)[:80]}",
+                f"{' and '.join(RESERVED)}; got {ascii(name)[:80]}",
             )
         try:
             with self._database.writing.begin() as session:
@@ -208,8 +205,7 @@ class Contexts(Queries):
                 raise DataError(
                     "name-taken",
                     f"expected a name that no other context has; {name} is the context {existing.id} with other PSFs "
-                    "or other series "
-                    "that may be interpolated, and contexts never change: choose another name",
+                    "or other series that may be interpolated, and contexts never change: choose another name",
                 ) from None
             return existing, False
 
@@ -311,10 +307,9 @@ def _pins_of(session: Session, owner: str, pins: Sequence[Pin]) -> list[PsfPinRo
         if one.series == other.series and first.overlaps(second):
             raise DataError(
                 "ranges-overlap",
-                f"expected at most one PSF of {one.series} for any time; the ranges of PSF {one.psf_id}, {first}, and "
-                "PSF "
-                f"{other.psf_id}, {second}, overlap: leave one out, or pin it with a narrower range (valid_from, "
-                "valid_to)",
+                f"expected at most one PSF of {one.series} for any time; the ranges of PSF {one.psf_id}, {first}, "
+                f"and PSF {other.psf_id}, {second}, overlap: leave one out, or pin it with a narrower range "
+                "(valid_from, valid_to)",
             )
     return rows
 

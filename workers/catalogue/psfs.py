@@ -256,8 +256,7 @@ def _certify(session: Session, row: PsfRow, columns: dict[str, Any], change: Sta
         raise DataError(
             "not-of-this-change",
             f"expected version {row.version}, because the version of a certified PSF cannot change; got "
-            f"{change.version}: "
-            "leave it out",
+            f"{change.version}: leave it out",
         )
     validity = change.validity or validity_of(row)
     for superseded_id in change.supersedes:
@@ -280,9 +279,8 @@ def _certify(session: Session, row: PsfRow, columns: dict[str, Any], change: Sta
         raise DataError(
             "ranges-overlap",
             f"expected a range that overlaps with no certified PSF of {series}; got {validity}, which overlaps with "
-            "the range of "
-            f"PSF {other.id} ({other.name} {other.version}), {validity_of(other)}: deprecate that PSF, name it "
-            "in `supersedes`, or change its range first",
+            f"the range of PSF {other.id} ({other.name} {other.version}), {validity_of(other)}: deprecate that PSF, "
+            "name it in `supersedes`, or change its range first",
         )
     validity_columns = {"valid_from": validity.start, "valid_to": validity.end}
     columns = columns | validity_columns | {"status": PsfStatus.CERTIFIED, "version": version}

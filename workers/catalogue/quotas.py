@@ -102,10 +102,8 @@ class Usage:
         assert self.limit_bytes is not None
         return (
             f"expected free room in your quota; {self.used_bytes / MIB:.1f} of {self.limit_bytes / MIB:.1f} MiB are "
-            "used, and "
-            f"{why}: delete products that you no longer need (`heliopsf product delete`), or ask the operator for a "
-            "larger "
-            "quota"
+            f"used, and {why}: delete products that you no longer need (`heliopsf product delete`), or ask the "
+            "operator for a larger quota"
         )
 
 

@@ -63,14 +63,12 @@ class SchemaStatus:
                 return (
                     f"the database is at revision {self.revision} of a development version, which heliopsf "
                     f"{software_version()} cannot upgrade: upgrade it first with the last version that can (see "
-                    "Upgrading "
-                    "in docs/operating.md), or use an empty database"
+                    "Upgrading in docs/operating.md), or use an empty database"
                 )
             case "unversioned":
                 return (
                     "expected an empty database or one of heliopsf; this one has tables with names of heliopsf's "
-                    "tables, but "
-                    "without a revision: use an empty database"
+                    "tables, but without a revision: use an empty database"
                 )
         return None
 
@@ -138,8 +136,7 @@ class Schema:
             there = "empty" if status.state == "empty" else f"at revision {status.revision}"
             raise SchemaError(
                 f"expected a database at revision {status.wanted}, which heliopsf {software_version()} needs; it is "
-                f"{there}: "
-                "upgrade it with `heliopsf database upgrade`, or start a server of this version"
+                f"{there}: upgrade it with `heliopsf database upgrade`, or start a server of this version"
             )
 
     def mend(self) -> None:

@@ -62,8 +62,7 @@ class StatusChange(TimeRange):
     channel: Word | None = Field(
         None,
         description="for a draft whose file names no wavelength; or a variant of its channel for one filter (card "
-        "FILTER) or plate "
-        "scale, such as `174-open_2` or `174-0.984arcsec`",
+        "FILTER) or plate scale, such as `174-open_2` or `174-0.984arcsec`",
     )
     kind: Word | None = Field(None, description="for an uploaded draft, such as `total`")
 

@@ -201,8 +201,7 @@ class Deconvolve(Treatment):
     psf_id: Identity | None = Field(
         None,
         description="id of a PSF of the catalogue; null: the certified PSF that fits the image, else the PSF built "
-        "from "
-        "the instrument file",
+        "from the instrument file",
     )
     context: ContextName | None = Field(
         None,
@@ -274,8 +273,7 @@ class CrossValidate(PsfFit):
     scheme: Literal["shared", "exact"] = Field(
         "shared",
         description="`shared`: all folds use the same reconstructions; `exact`: each fold makes its own "
-        "reconstructions "
-        "(slow; several workers share the folds)",
+        "reconstructions (slow; several workers share the folds)",
     )
     runs: int = Field(
         10, ge=1, le=50, description="number of runs; each run holds out every block once (the paper uses 10)"
@@ -385,8 +383,7 @@ class PsfInterpolate(Parameters):
         if not before <= at <= after:
             raise ValueError(
                 f"time: expected a time from {self.before_time} to {self.after_time}, because PSFs are not "
-                "extrapolated; got "
-                f"{self.time}: name PSFs whose times enclose it"
+                f"extrapolated; got {self.time}: name PSFs whose times enclose it"
             )
         return self
 

@@ -140,9 +140,8 @@ def collect(
     if there and len(left) == len(there):
         raise DataError(
             "nothing-named",
-            f"expected a database that refers to some of the {len(there)} files of the store; this one refers to none "
-            "of them: check "
-            "that the settings name the right database",
+            f"expected a database that refers to some of the {len(there)} files of the store; this one refers to "
+            "none of them: check that the settings name the right database",
         )
     old = [blob for blob in left.values() if blob.kept_at < kept_before]
     made_again = {row.file_sha256 for row in solutions}
@@ -150,11 +149,9 @@ def collect(
     if not dry_run and not even_most and 2 * len(lost) > len(there):
         raise DataError(
             "most-unnamed",
-            f"expected a database that refers to most of the {len(there)} files of the store; this one does not refer "
-            "to "
-            f"{len(lost)} old files: check that the settings name the right database. Nothing was removed; to remove "
-            "them "
-            "all, add --even-most",
+            f"expected a database that refers to most of the {len(there)} files of the store; this one does not "
+            f"refer to {len(lost)} old files: check that the settings name the right database. Nothing was removed; "
+            "to remove them all, add --even-most",
         )
     if not dry_run:
         catalogue.quotas.forget_solutions(solutions)

@@ -114,8 +114,7 @@ class PartialUploads:
                 raise DataError(
                     "upload-locked",
                     "expected one request at a time for an upload; another request sends bytes now: ask for its "
-                    "offset, "
-                    "then try again",
+                    "offset, then try again",
                 ) from None
             file.seek(0, os.SEEK_END)
             yield file

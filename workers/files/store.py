@@ -34,8 +34,7 @@ from workers.settings import Settings
 
 ADVICE = (
     "if it was uploaded, upload it again; if a job made it, submit the same request again, and the job makes it "
-    "again; if "
-    "this does not help, tell the operator, who finds such files with `heliopsf store check`"
+    "again; if this does not help, tell the operator, who finds such files with `heliopsf store check`"
 )
 DAMAGED = f"its content has changed on the disk: {ADVICE}"
 STORAGE_FULL = "storage-full"  # the code of such an error

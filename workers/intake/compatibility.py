@@ -152,9 +152,8 @@ def _end_warning(catalogue: Catalogue, psf: PsfRow) -> str | None:
         if end is not None and end.status == PsfStatus.DEPRECATED:
             return (
                 f"PSF {psf.id[:SHOWN_DIGITS]} ({psf.name} {psf.version}) was interpolated from PSF "
-                f"{end_id[:SHOWN_DIGITS]} "
-                f"({end.name} {end.version}), which was deprecated ({_reason(catalogue, end)}); use another PSF for "
-                "new products"
+                f"{end_id[:SHOWN_DIGITS]} ({end.name} {end.version}), which was deprecated "
+                f"({_reason(catalogue, end)}); use another PSF for new products"
             )
     return None
 

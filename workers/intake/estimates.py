@@ -82,10 +82,8 @@ def checked(
         raise DataError(
             "too-much-memory",
             f"expected a job of at most {settings.max_job_memory_mib} MiB (HELIOPSF_MAX_JOB_MEMORY_MIB; its default "
-            "follows "
-            "from the memory and the worker processes of the service's machine); this one needs about "
-            f"{expected.memory_mib} "
-            f"MiB: {KINDS[kind].memory_advice}",
+            "follows from the memory and the worker processes of the service's machine); this one needs about "
+            f"{expected.memory_mib} MiB: {KINDS[kind].memory_advice}",
         )
     if expected.seconds > settings.max_job_s:
         raise DataError(

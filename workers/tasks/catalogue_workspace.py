@@ -152,8 +152,7 @@ class CatalogueWorkspace(Workspace):
                 raise DataError(
                     "instrument-changed",
                     f"expected PSF {request.psf_id} from the instrument file of {recipe.instrument}; got {identity}: "
-                    "the "
-                    "file changed after the job was submitted; submit the job again",
+                    "the file changed after the job was submitted; submit the job again",
                 )
         return self.row(PsfRow, request.psf_id)
 
@@ -168,9 +167,8 @@ class CatalogueWorkspace(Workspace):
             yield folder
 
     def inverter(self, request: ResolvedOnTransit) -> Inverter:
-        from workers.tasks.solutions import (
-            KeptSolutions,  # a deconvolution does not load what an inversion needs
-        )
+        # A deconvolution does not load what an inversion needs.
+        from workers.tasks.solutions import KeptSolutions
 
         kept = KeptSolutions(self.catalogue, self.store, self.settings, self.owner, self.job_id, self.anew)
         return partial(kept.solved, request)

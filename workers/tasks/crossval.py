@@ -113,11 +113,10 @@ def sentence(found: Bands, folds: int) -> str:
     """The sentence at the top of the report."""
     total, held_out = found.values["total"], found.held_out
     return (
-        f"{folds} fits with held-out blocks and bootstrapped images: {100 * total[2]:.1f} % of the light is scattered "
-        f"diffusely (1 sigma: {100 * total[1]:.1f} to {100 * total[3]:.1f} %). The residual of held-out images is "
-        f"{held_out['mean_pct']:+.1f} % on average, {held_out['rms_pct']:.1f} % rms and {held_out['largest_pct']:.1f} "
-        "% at "
-        f"most.{_free_shells(found)}"
+        f"{folds} fits with held-out blocks and bootstrapped images: {100 * total[2]:.1f} % of the light is "
+        f"scattered diffusely (1 sigma: {100 * total[1]:.1f} to {100 * total[3]:.1f} %). The residual of held-out "
+        f"images is {held_out['mean_pct']:+.1f} % on average, {held_out['rms_pct']:.1f} % rms and "
+        f"{held_out['largest_pct']:.1f} % at most.{_free_shells(found)}"
     )
 
 

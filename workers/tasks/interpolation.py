@@ -83,8 +83,8 @@ def _fit_of(psf: Psf, threads: int) -> dict[str, Any]:
     before, after = psf.provenance["interpolated_between"]
     return {
         "sentence": f"Interpolated to {psf.provenance['interpolated_at']} between {before['name']} "
-        f"{before['version']} (weight "
-        f"{before['weight']:.3f}) and {after['name']} {after['version']} (weight {after['weight']:.3f}).",
+        f"{before['version']} (weight {before['weight']:.3f}) and {after['name']} {after['version']} (weight "
+        f"{after['weight']:.3f}).",
         "shape": psf.fitted.shape,
         "parameters": parameters_of(psf.fitted),
         "curve": {

@@ -58,8 +58,7 @@ def _mount_image(workspace: Workspace, build: PsfBuild, instrument: Instrument) 
     if build.mask_id is None:
         raise DataError(
             "mask-missing",
-            f"mask_id: expected the id of the mask image {named.file}, which mount.mask_image names; got none: upload "
-            "the "
-            "file and give its id",
+            f"mask_id: expected the id of the mask image {named.file}, which mount.mask_image names; got none: "
+            "upload the file and give its id",
         )
     return read_plane(workspace.image_file(build.mask_id), workspace.limits)

@@ -134,9 +134,8 @@ def _save(
     }
     named = ("of", "sentence", "same", "same_file", "largest_relative_difference")
     details = {name: said[name] for name in named} | {"output_sha256": again.file_sha256}
-    workspace.report(
-        "comparing", 1, 1
-    )  # raises an exception if the job was cancelled, so that no report is kept
+    # This raises an exception if the job was cancelled, so that no report is kept.
+    workspace.report("comparing", 1, 1)
     workspace.add(report_result(identity, KIND, said, details, about_id=request.id))
 
 

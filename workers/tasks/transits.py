@@ -30,8 +30,7 @@ def load_transit(
             raise DataError(
                 "no-known-psf",
                 "expected known_psf in transit.json, or an instrument whose diffraction PSF can be built; got "
-                "neither: add "
-                "the file of the known PSF to the transit",
+                "neither: add the file of the known PSF to the transit",
             )
         return workspace.built_psf(request.diffraction_recipe).kernel
 

@@ -1,7 +1,7 @@
 """The workspace of a task: where the task finds its inputs, and where it puts its results.
 
 A task knows this interface alone. A service implements it on the catalogue and the store
-(`workers.tasks.catalogue_workspace`), a command with ``--local`` on the user's files (`service.cli.local`).
+(`workers.tasks.catalogue_workspace`), a command with ``--local`` on the user's files (`service.cli.local_workspace`).
 """
 
 from __future__ import annotations

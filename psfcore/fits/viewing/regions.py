@@ -101,8 +101,7 @@ def cut_out(target: BinaryIO, *, path: str, frame: Frame, edge: list[list[float]
         parts = [_cut(hdu, columns, rows) for hdu in (image, *planes)]
         parts[0].header.add_history(
             f"heliopsf: columns {columns.start} to {columns.stop - 1}, rows {rows.start} to {rows.stop - 1} (counted "
-            "from 0) of "
-            f"{nx} x {ny} px"
+            f"from 0) of {nx} x {ny} px"
         )
         fits.HDUList(parts).writeto(target, checksum=True)
     return {}

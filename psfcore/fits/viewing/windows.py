@@ -62,8 +62,7 @@ def window_of(
         raise DataError(
             "window-outside",
             f"expected a window inside the plane of {nx} x {ny} px: x + width at most {nx}, y + height at most {ny}; "
-            f"got x {x}, "
-            f"y {y}, width {width}, height {height}",
+            f"got x {x}, y {y}, width {width}, height {height}",
         )
     return Window(x, y, width, height, step)
 

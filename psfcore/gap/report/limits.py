@@ -17,8 +17,7 @@ NOT_FOUND = "not found"
 SEARCHED = "*"
 OF_SEARCH = (
     f"{SEARCHED} The effect searches for its position or form; the strength holds for the position or form that the "
-    "search "
-    "found in the simulated images."
+    "search found in the simulated images."
 )
 
 

@@ -261,14 +261,12 @@ def _nowhere(found: Diagnosis) -> str:
     images = len(found.evidence.discs)
     if found.residual is None:
         return (
-            f"no gap is visible in these {images} images, but a gap may exist: with fewer than {LEAST_IMAGES} images, "
-            "no image can "
-            "be held out."
+            f"no gap is visible in these {images} images, but a gap may exist: with fewer than {LEAST_IMAGES} "
+            "images, no image can be held out."
         )
     return (
         f"no gap is detected: on held-out images the discs differ from the model by {_gap_words(found)} beyond the "
-        "noise of "
-        f"{found.noise_pct:.1f} %."
+        f"noise of {found.noise_pct:.1f} %."
     )
 
 

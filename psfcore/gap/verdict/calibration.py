@@ -48,8 +48,7 @@ class Calibration:
             raise DataError(
                 "bad-coverage",
                 f"expected a coverage above 0 and at most {count / (count + 1):.3f}, for which {count} simulated "
-                "cases are "
-                f"enough; got {coverage:g}",
+                f"cases are enough; got {coverage:g}",
             )
         found = sorted(self.levels)[rank - 1]
         return coverage if found > MOST else max(found, coverage)

@@ -197,8 +197,7 @@ def _fit_remaining(model: LinearModel, held: Sequence[Effect], out: Vector) -> t
         raise DataError(
             "effect-unseen",
             f"expected the images to constrain all {out.size} parameters of {label_of([e.name for e in held])} after "
-            "this effect "
-            f"was subtracted; the images constrain {found.size} of them: they may not contain this effect",
+            f"this effect was subtracted; the images constrain {found.size} of them: they may not contain this effect",
         )
     base = len(model.evidence.base)
     found -= model.pull_of_prior(left.step, np.concatenate([np.zeros(base), out]))[base:]

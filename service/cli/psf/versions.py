@@ -123,8 +123,7 @@ def instruments() -> None:
     for instrument in map(load_instrument, instrument_names()):
         echo(
             f"{instrument.name:<12}  {instrument.wavelength_angstrom:6.1f} angstrom  {instrument.version}  "
-            f"{instrument.status}  "
-            f"`heliopsf psf build --instrument {instrument.name} -o FILE`"
+            f"{instrument.status}  `heliopsf psf build --instrument {instrument.name} -o FILE`"
         )
 
 
