@@ -9,7 +9,7 @@ import sys
 from psfcore.drawing.page import render
 from psfcore.gap.evidence.linear_model import UNLIKELY
 from psfcore.gap.planning import Planned
-from psfcore.gap.report.report import words
+from psfcore.gap.report.report import unit_words, words
 from psfcore.gap.verdict.limits import ALIKE, Limits, ParameterLimits
 
 Row = list[str]
@@ -29,7 +29,7 @@ def limit_rows(limits: Limits) -> list[Row]:
             words(one.name),
             strength,
             "" if one.excluded_95 is None else f"{one.excluded_95:.3g}",
-            one.unit,
+            unit_words(one.unit),
         ]
         for name, one, strength in _strengths(limits)
     ]
@@ -121,7 +121,7 @@ def strength_rows(found: Planned) -> list[Row]:
             _marked(name, words(name), found),
             words(one.name),
             strength,
-            one.unit,
+            unit_words(one.unit),
             f"{one.likely:.3g}",
             _remark(one),
             found.settled_by[name],

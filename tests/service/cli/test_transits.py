@@ -200,7 +200,14 @@ def test_the_next_step_is_a_command_that_works_here(
     folder: Path, diagnosed: Diagnosed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tied = replace(diagnosed.found, corrected=None, answer=replace(diagnosed.found.answer, verdict="tie"))
-    for found, step in ((diagnosed.found, f"gap {folder} --local --corrected "), (tied, "gap plan ")):
+    # A PSF corrected for the most probable of several effects is no next step.
+    both = replace(tied, corrected=diagnosed.found.corrected)
+    steps = (
+        (diagnosed.found, f"gap {folder} --local --corrected "),
+        (tied, "gap plan "),
+        (both, "gap plan "),
+    )
+    for found, step in steps:
         answer_at_once(monkeypatch, found)
         said = run(folder, "--local").output.splitlines()
         assert said[-1].startswith(f"next: `heliopsf {step}")
