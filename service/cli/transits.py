@@ -214,7 +214,7 @@ def diagnose(
         echo(f"next: {step}")
     if corrected_file is not None and corrected is None:
         raise click.ClickException(
-            f"{corrected_file} was not written: the diagnosis found no effect for a corrected PSF (verdict "
+            f"{corrected_file} was not written: the diagnosis gave no corrected PSF (verdict "
             f"{report['verdict']})"
         )
 

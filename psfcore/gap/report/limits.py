@@ -88,7 +88,7 @@ def sentence(found: Planned) -> str:
     alike = f"{pairs} pair{'s' if pairs > 1 else ''} of effects could not be told apart"
     return (
         f"The images of this plan would show {visible} of {len(limits.effects)} effects at their likely size; "
-        f"{alike if pairs else 'all of them could be told apart'}."
+        f"{alike if pairs else 'no pair of the effects that would be found looks alike'}."
     )
 
 
@@ -106,7 +106,8 @@ def lines(found: Planned) -> list[str]:
         out.append(f"{_marked(name, name, found):<28}{at:<34}{likely:<14}{_remark(one)}".rstrip())
     out += ["", f"could not be told apart (distance below {ALIKE:g} sigma):"]
     out += [
-        f"  {one.distance:.2f}  {' and '.join(one.pair)}: take {one.would_separate}" for one in limits.alike
+        f"  {one.distance:.2f}  {' and '.join(one.pair)}{one.would_separate and f': take {one.would_separate}'}"
+        for one in limits.alike
     ]
     out += [] if limits.alike else ["  none"]
     out += [f"not testable: {name} ({why})" for name, why in limits.untestable.items()]

@@ -159,7 +159,8 @@ def draw_unocculted(axes: Any, report: Report) -> None:
         before, after = (_column(rows, name)[here] for name in ("unocculted", "unocculted_after"))
         axes.plot(minutes[here], before, symbol, color=colour, ms=5, mew=0, label=f"pointing {fov}")
         axes.plot(minutes[here], after, symbol, color=colour, ms=4.5, mfc="white", mew=1.2)
-    axes.set(xlabel="Time from the first image (min)", ylabel="Residual (noise)", yscale="log")
+    axes.set(xlabel="Time from the first image (min)", ylabel="Residual (noise)")
+    axes.set_ylim(bottom=0.0)
     axes.legend(fontsize=8.5, loc="best", framealpha=0.85, edgecolor="none")
     tidy([axes])
 

@@ -345,14 +345,13 @@ def _nothing(found: Diagnosis) -> str:
 
 def _weaker(found: Diagnosis) -> str:
     told = [
-        f"{words(name)} above {words(one.leading.name)} {one.leading.excluded_95:.2g} {unit_words(one.leading.unit)}"
-        for name, one in found.limits.effects.items()
-        if one.leading.excluded_95 is not None and one.leading.found_90 is not None
+        f"{words(name)} ({words(one.name)} above {one.excluded_95:.2g} {unit_words(one.unit)}".rstrip() + ")"
+        for name, one in ((name, each.leading) for name, each in found.limits.effects.items())
+        if one.excluded_95 is not None and one.found_90 is not None
     ]
     if not told:
         return "these data exclude no effect."
-    shown = ", ".join(one.rstrip() for one in told[:MOST_LIMITS])
-    return f"these data exclude (95 %) {shown}; the limits of all effects are in the report."
+    return f"these data exclude (95 %) {', '.join(told[:MOST_LIMITS])}; the limits of all effects are in the report."
 
 
 def _gap_words(gap: Interval) -> str:
@@ -393,7 +392,8 @@ def axes_words(where: Sequence[Axis]) -> str:
     told = sorted(told, key=lambda axis: -axis.share)[:MOST_AXES]
     if not told:
         return ""
-    shown = ", ".join(f"{AXIS_WORDS[axis.name]} ({100 * axis.share:.0f} %)" for axis in told)
+    *others, last = (f"{AXIS_WORDS[axis.name]} ({100 * axis.share:.0f} %)" for axis in told)
+    shown = f"{', '.join(others)} and {last}" if others else last
     most = max(where, key=lambda axis: axis.share)
     if most.p_value <= SIGNIFICANT:
         return f"; it varies {shown}"
@@ -521,8 +521,8 @@ def _how_far(found: Diagnosis) -> str:
     size = unocculted_size(found)
     if not size.shows_the_gap:
         return (
-            f"on held-out images, {out}{beside}the gap in the discs {change_words(found.rms, found.after)}, with a "
-            f"noise of {found.noise_pct:.1f} %."
+            f"on held-out images, {out}{beside}the gap in the discs {change_words(found.rms, found.after)}; the "
+            f"noise is {found.noise_pct:.1f} %."
         )
     if size.before is None or size.after is None:
         return f"on held-out images, {out}."

@@ -192,7 +192,7 @@ def test_a_corrected_psf_that_there_is_not_is_said_after_all_else(
     assert [how["coverage"] for how in asked] == [0.8]
     assert done.exit_code == 1 and not psf.exists()
     assert done.output.splitlines()[3] == "verdict: none"
-    assert "was not written: the diagnosis found no effect for a corrected PSF (verdict none)" in done.output
+    assert "was not written: the diagnosis gave no corrected PSF (verdict none)" in done.output
     assert json.loads(numbers.read_text())["verdict"] == "none"
 
 

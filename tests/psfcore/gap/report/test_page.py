@@ -167,11 +167,11 @@ def test_every_kind_of_answer_is_explained_on_its_page(kind: str, blank: None) -
 
 
 def test_what_has_no_picture_is_told_in_words(blank: None) -> None:
-    assert "No two effects are closer than 3 sigma" in text_of(html())
+    assert "No two effects that would be found are closer than 3 sigma" in text_of(html())
     pair = Alike(("dark_offset", "core_blur"), 1.4, "a series of exposure times")
     page = page_of(replace(found(), limits=replace(found().limits, alike=(pair,))))
     assert ["dark offset and core blur", "1.40", "a series of exposure times"] in rows_of(page)
-    assert "No two effects are closer" not in text_of(page)
+    assert "No two effects that" not in text_of(page)
     few = replace(judged("none"), residual=None)
     page = page_of(few)
     check_stands_alone(page)

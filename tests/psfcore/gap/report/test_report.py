@@ -42,7 +42,7 @@ FIELDS |= dict.fromkeys(
 )
 # Words that the lines of an answer contain: of WHICH, and of HOW FAR.
 SAID = {
-    "none": (["no cause", "70 %", "dark offset (15 %)"], ["dark offset above offset", "DN"]),
+    "none": (["no cause", "70 %", "dark offset (15 %)"], ["dark offset (offset above", "DN"]),
     "name": (["dark offset (offset = 6.", "DN; 95 %", "confirm it, take a dark"], ["dark offset closes", "falls from"]),
     "two": (["dark offset (offset = 6.", "beside it core blur (variance", "To confirm them"], []),
     "beside": (["dark offset", f"; beside it {FAMILIES['light_place'].words}, in a form"], ["with another form of"]),
@@ -185,10 +185,10 @@ def test_the_axes_of_the_first_line_are_significant_and_in_order() -> None:
         if axis.name in shares
     ]
     line = report_of(replace(named, where=tuple(axes)))["lines"][0]
-    assert "it varies most clearly along detector x (30 %), in time (20 %), although" in line
+    assert "it varies most clearly along detector x (30 %) and in time (20 %), although" in line
     assert "although the share with the exposure time is 40 %, which is not significant (p = 0.5)" in line
     axes = [replace(axis, share=0.25) if axis.name == "exposure" else axis for axis in axes]
-    assert axes_words(axes) == "; it varies along detector x (30 %), in time (20 %)"
+    assert axes_words(axes) == "; it varies along detector x (30 %) and in time (20 %)"
     assert axes_words([replace(axis, p_value=0.5) for axis in axes]) == ""
 
 
