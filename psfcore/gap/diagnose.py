@@ -53,6 +53,8 @@ from psfcore.scatter.reconstruction import Progress, Solution, labelled
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Shape, shape_named
 from psfcore.transit.transit import Fold, Transit
 
+MOST_EXAMPLES = 3  # of images that were not used, in a caution
+
 
 @dataclass(frozen=True, eq=False)
 class Shrinking:
@@ -366,8 +368,10 @@ def cautions_of(solution: Solution, noise: MeasuredNoise | None, evidence: Evide
     unmatched = [info.file for info in infos if not info.described]
     some = f"{', '.join(unmatched[:3])}{', …' if len(unmatched) > 3 else ''}"
     aimed = len({info.pointing for info in evidence.image_info})
+    unused = f"{len(left_out)} image{'s were' if len(left_out) > 1 else ' was'} not used"
+    examples = ". Examples: " if len(left_out) > MOST_EXAMPLES else ": "
     rows = (
-        (left_out, f"{len(left_out)} images were not used. Examples: {'; '.join(left_out[:3])}"),
+        (left_out, f"{unused}{examples}{'; '.join(left_out[:MOST_EXAMPLES])}"),
         (
             unmatched,
             f"In {len(unmatched)} images ({some}) the scene around the occulter differs from the scene in the "

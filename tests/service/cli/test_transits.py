@@ -192,7 +192,7 @@ def test_a_corrected_psf_that_there_is_not_is_said_after_all_else(
     assert [how["coverage"] for how in asked] == [0.8]
     assert done.exit_code == 1 and not psf.exists()
     assert done.output.splitlines()[3] == "verdict: none"
-    assert "was not written: the diagnosis found no effect for a corrected PSF (verdict none)" in done.output
+    assert "was not written: the diagnosis gave no corrected PSF (verdict none)" in done.output
     assert json.loads(numbers.read_text())["verdict"] == "none"
 
 
@@ -200,7 +200,14 @@ def test_the_next_step_is_a_command_that_works_here(
     folder: Path, diagnosed: Diagnosed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tied = replace(diagnosed.found, corrected=None, answer=replace(diagnosed.found.answer, verdict="tie"))
-    for found, step in ((diagnosed.found, f"gap {folder} --local --corrected "), (tied, "gap plan ")):
+    # A PSF corrected for the most probable of several effects is no next step.
+    both = replace(tied, corrected=diagnosed.found.corrected)
+    steps = (
+        (diagnosed.found, f"gap {folder} --local --corrected "),
+        (tied, "gap plan "),
+        (both, "gap plan "),
+    )
+    for found, step in steps:
         answer_at_once(monkeypatch, found)
         said = run(folder, "--local").output.splitlines()
         assert said[-1].startswith(f"next: `heliopsf {step}")
