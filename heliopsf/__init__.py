@@ -19,8 +19,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from heliopsf.images import convolve as convolve
     from heliopsf.images import deconvolve as deconvolve
     from heliopsf.images import psf_for as psf_for
+    from heliopsf.outputs import Convolution as Convolution
     from heliopsf.outputs import Deconvolution as Deconvolution
     from heliopsf.parameters import Options as Options
     from heliopsf.psfs import Psf as Psf
@@ -41,8 +43,8 @@ if TYPE_CHECKING:
 
 # The names of each module.
 _MODULES = {
-    "heliopsf.images": "deconvolve psf_for",
-    "heliopsf.outputs": "Deconvolution",
+    "heliopsf.images": "convolve deconvolve psf_for",
+    "heliopsf.outputs": "Convolution Deconvolution",
     "heliopsf.parameters": "Options",
     "heliopsf.psfs": "Psf build_psf interpolate_psf read_psf",
     "heliopsf.transits": "GapDiagnosis ScatterFit diagnose_gap fit_scatter",

@@ -25,12 +25,14 @@ from heliopsf.inputs import (
     shape_of,
     uncertainty_of,
 )
-from heliopsf.outputs import Deconvolution, in_form_of
-from heliopsf.parameters import Options, Progress, Steps, noise_of, number, reporter, whole
+from heliopsf.outputs import Convolution, Deconvolution, in_form_of
+from heliopsf.parameters import Number, Options, Progress, Steps, noise_of, number, reporter, whole
 from heliopsf.psfs import AnyPsf, Psf, built_psf, given_psf, instrument_named
 from psfcore.deconvolve.camera_noise import measured_noise
 from psfcore.deconvolve.conditions import PreparedPsfs
+from psfcore.deconvolve.declaration import Edges
 from psfcore.deconvolve.doubts import input_warnings
+from psfcore.deconvolve.forward import convolve_image
 from psfcore.deconvolve.methods.registry import properties_of
 from psfcore.deconvolve.run import BUILDING, DECONVOLVING, PsfSource, read_and_deconvolve
 from psfcore.deconvolve.work import Options as WorkOptions
@@ -208,6 +210,77 @@ def deconvolve(
             message = f"image {count} of {len(images)}: {error.message}"
             raise type(error)(error.code, message, error.fields) from error
     return type(smap)(*results) if is_sequence(smap) and not full else results
+
+
+def convolve(
+    smap: Any,
+    psf: AnyPsf | None = None,
+    *,
+    edges: Edges = "zero",
+    full: bool = False,
+    hdu: int | None = None,
+    plate_scale_arcsec: Number | None = None,
+    other_channel: bool = False,
+    threads: int | None = None,
+    progress: Progress = None,
+) -> Any:
+    """Convolve a model image with a PSF: what the telescope would record. The result has the form of the image.
+
+        >>> recorded = heliopsf.convolve(model, "aia_171")
+
+    Parameters
+    ----------
+    smap : Map, NDData, NDCube, array, (array, header), HDU, HDUList, path, bytes or Image
+        The model image. For a path, the bytes of a file or an ``Image`` the result is a ``Convolution``. Pixels that
+        are NaN or masked as not finite send no light; they are NaN in the result.
+    psf : Psf, path, name, array, optional
+        As for ``deconvolve``. The PSF is rebinned if the image is binned, and turned if it is turned.
+    edges : {"zero", "symmetric"}
+        The scene beyond the image: dark, or its mirror image.
+    full : bool
+        Return a ``Convolution`` for every form of image.
+    hdu, plate_scale_arcsec, other_channel, threads, progress
+        As in ``heliopsf.Options``.
+
+    Returns
+    -------
+    Map, NDData, array, HDU, HDUList or Convolution
+        In the unit of the image, with the cards CNVPSFID, CNVPSFN, CNVPSFV and CNVEDGE, and HISTORY.
+
+    Raises
+    ------
+    DataError
+        "bad-edges", "no-signal", "all-masked", "no-psf-for-instrument", "channel-mismatch" or "plate-scale-mismatch",
+        and the errors of reading.
+
+    Warns
+    -----
+    DataWarning
+        With its ``code``, for what may make the PSF wrong for this image.
+    """
+    count = cores() if threads is None else whole("threads", threads, "bad-threads")
+    scale = plate_scale_arcsec
+    if scale is not None:
+        scale = number("plate_scale_arcsec", scale, units.arcsec / units.pix, units.arcsec)
+    source = partial(
+        PsfSource,
+        possible_psfs=lambda *_: (),
+        plate_scale_arcsec=scale,
+        other_channel=other_channel,
+    )
+    building = reporter(progress is True, BUILDING)
+    if psf is None:
+        of_image = source(partial(_built_for, threads=count, parts=False))
+    else:
+        own = given_psf(psf, threads=count, progress=building)
+        of_image = source(lambda *_: own, key=id(own))
+    with on_disk(smap) as there:
+        image = image_of(there, saturation=None, hdu=hdu)
+        found = convolve_image(image, of_image, edges=edges, threads=count, begin=lambda *_: building)
+        for code, message in found.warnings.items():
+            warnings.warn(DataWarning(code, message), stacklevel=2)
+        result = Convolution(**vars(found) | {"psf": Psf.of(found.psf)})
+        return result if full else in_form_of(there, result)
 
 
 def psf_for(image: Any, *, threads: int | None = None, progress: Progress = None) -> Psf:

@@ -18,9 +18,11 @@ from numpy.typing import NDArray
 
 from heliopsf.inputs import hdu_of, is_hdu, is_map, is_nddata, is_pair
 from heliopsf.psfs import Psf, Shown
-from psfcore.deconvolve.run import Product, UsedPsf, deconvolution_cards, deconvolution_history
+from psfcore.deconvolve.forward import Convolved
+from psfcore.deconvolve.run import Cards, Product, UsedPsf, deconvolution_cards, deconvolution_history
 from psfcore.deconvolve.summary import summary_lines
 from psfcore.errors import module_of_extra
+from psfcore.files import whole_path
 from psfcore.fits.images import CARD_OF_PASS, STATISTICS, passes_of
 from psfcore.image import Image
 
@@ -107,6 +109,17 @@ class Deconvolution(Shown, Product):
         """The measured changes: flux, bright and dark structures, and signs of artefacts (JSON)."""
         return self.assessed.changes.as_json()
 
+    def cards(self) -> Cards:
+        """The cards of the result in the form of the user's image."""
+        passes = passes_of(self.image.header) + 1
+        return deconvolution_cards(self, used_psf(self.psf)) | {
+            CARD_OF_PASS: (passes, "deconvolutions of this image, with this one")
+        }
+
+    def history(self) -> list[str]:
+        """The lines of HISTORY."""
+        return deconvolution_history(self, used_psf(self.psf))
+
     def lines(self) -> list[str]:
         """Describe the result in two lines.
 
@@ -176,7 +189,106 @@ class Deconvolution(Shown, Product):
         return cast("Figure", module_of_extra("heliopsf.plots").before_and_after(self))
 
 
-def in_form_of(image: Any, result: Deconvolution) -> Any:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Convolution(Shown, Convolved):
+    """A model image as a telescope records it.
+
+    Attributes
+    ----------
+    pixels : ndarray of float64, shape (ny, nx)
+        The convolved image [y, x] in the unit of the image. NaN: the image has no finite value there.
+    image : Image
+        The model image with its header.
+    psf : Psf
+        The PSF on the pixels of the image.
+    edges : {"zero", "symmetric"}
+        Assumption about the scene beyond the image.
+    warnings : mapping of str to str
+        Sentences by their codes.
+    """
+
+    psf: Psf
+
+    @property
+    def mask(self) -> NDArray[np.bool_]:
+        """Pixels without a value in the model image, [y, x]."""
+        return ~self.image.finite
+
+    @property
+    def error(self) -> None:
+        """None: a convolved model image has no errors."""
+
+    @property
+    def planes(self) -> dict[str, NDArray[np.generic]]:
+        """No planes, unlike a ``Deconvolution``."""
+        return {}
+
+    def cards(self) -> Cards:
+        """The cards of the result in the form of the user's image."""
+        return self.cards_for(used_psf(self.psf))
+
+    def history(self) -> list[str]:
+        """The lines of HISTORY."""
+        return self.history_for(used_psf(self.psf))
+
+    def lines(self) -> list[str]:
+        """Describe the result in two lines.
+
+        Returns
+        -------
+        list of str
+            PSF and edges; then shape, brightest pixel, and the share of the light that stays in the field.
+        """
+        return self.lines_for(used_psf(self.psf))
+
+    def quicklook(self) -> Figure:
+        """Draw the image before and after, and the change.
+
+        Returns
+        -------
+        Figure
+            Three panels.
+
+        Raises
+        ------
+        MissingExtra
+            The extra "plot" is not installed.
+        """
+        return cast("Figure", module_of_extra("heliopsf.plots").before_and_after(self))
+
+    def title(self, psf: UsedPsf) -> str:
+        """Name the PSF, for the title of a picture.
+
+        Parameters
+        ----------
+        psf : UsedPsf
+            The PSF as the cards of the result name it.
+
+        Returns
+        -------
+        str
+            One line.
+        """
+        return f"convolved with PSF {psf.name} {psf.version}"
+
+    def write(self, path: str | Path) -> None:
+        """Write a FITS file. A file of this name is replaced.
+
+        Parameters
+        ----------
+        path : str or path
+            The file; a name that ends in .gz gets a file in gzip.
+
+        Raises
+        ------
+        OSError
+            The file cannot be written.
+        """
+        with whole_path(Path(path)) as file:
+            self.write_as(file, used_psf(self.psf))
+
+
+def in_form_of(image: Any, result: Deconvolution | Convolution) -> Any:
     """The result in the form of the user's image: a Map for a Map, an HDU for an HDU, an array for an array."""
     if is_map(image):
         return _as_map(image, result)
@@ -214,7 +326,7 @@ def used_psf(psf: Psf) -> UsedPsf:
     return UsedPsf(str(identity), psf.name, psf.version, psf.status)
 
 
-def _as_map(image: Any, result: Deconvolution) -> Any:
+def _as_map(image: Any, result: Deconvolution | Convolution) -> Any:
     meta = _described(image.meta, result)
     smap = type(image)(result.pixels, meta, mask=_mask(image, result), uncertainty=_uncertainty(result))
     # The settings are set last, because the class of a Map may choose other settings for a new Map.
@@ -222,7 +334,7 @@ def _as_map(image: Any, result: Deconvolution) -> Any:
     return smap
 
 
-def _as_nddata(image: Any, result: Deconvolution) -> Any:
+def _as_nddata(image: Any, result: Deconvolution | Convolution) -> Any:
     return type(image)(
         result.pixels,
         mask=_mask(image, result),
@@ -233,11 +345,11 @@ def _as_nddata(image: Any, result: Deconvolution) -> Any:
     )
 
 
-def _mask(image: Any, result: Deconvolution) -> NDArray[np.bool_] | None:
+def _mask(image: Any, result: Deconvolution | Convolution) -> NDArray[np.bool_] | None:
     return result.mask if image.mask is not None or result.mask.any() else None
 
 
-def _uncertainty(result: Deconvolution) -> Any:
+def _uncertainty(result: Deconvolution | Convolution) -> Any:
     if result.error is None:
         return None
     from astropy.nddata import StdDevUncertainty
@@ -249,18 +361,15 @@ def _stored(plane: NDArray[np.generic]) -> NDArray[np.generic]:
     return plane.astype(np.float32) if plane.dtype.kind == "f" else plane
 
 
-def _described(of_image: Any, result: Deconvolution) -> Any:
-    """The metadata of the image with the cards and the history of a product."""
+def _described(of_image: Any, result: Deconvolution | Convolution) -> Any:
+    """The metadata of the image with the cards and the history of the result."""
     meta = copy.deepcopy(of_image)
-    used = used_psf(result.psf)
     is_header = isinstance(meta, Header)
     for key in [key for key in meta if _REMOVED.fullmatch(str(key))]:
         del meta[key]
-    cards = deconvolution_cards(result, used)
-    cards[CARD_OF_PASS] = (passes_of(result.image.header) + 1, "deconvolutions of this image, with this one")
-    for key, (value, comment) in cards.items():
+    for key, (value, comment) in result.cards().items():
         meta[key] = (value, comment) if is_header else value
-    lines = deconvolution_history(result, used)
+    lines = result.history()
     if is_header:
         for line in lines:
             meta.add_history(line)

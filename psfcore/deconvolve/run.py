@@ -261,6 +261,24 @@ class PsfSource:
     provenance: Mapping[str, Any] | None = None
     warnings: Mapping[str, str] = field(default_factory=dict)
 
+    def on_pixels_of(self, header: Header, load: Callable[[], Psf]) -> tuple[Psf, Psf, str | None]:
+        """The PSF as it is read or built, the PSF on the pixels of an image with this header, and the answer of
+        `check_channel`. load: calls `load` of this source.
+        """
+        of_telescope = known_instrument(header), frame_of(header).turn_to_build_deg
+        key = (of_telescope if self.key is None else self.key, self.plate_scale_arcsec)
+
+        def as_built() -> Psf:
+            return with_scale(load(), self.plate_scale_arcsec)
+
+        # A build takes a minute, so what the instrument file says is compared first.
+        origin = self.built or self.seen_as(self.prepared.as_built(key, as_built))
+        channel = check_channel(origin, header, other_channel=self.other_channel)
+        if self.built is not None:
+            binning_factor(with_scale(self.built, self.plate_scale_arcsec), header)
+        whole = self.prepared.as_built(key, as_built)
+        return whole, self.prepared.on_pixels_of(header, key, as_built), channel
+
 
 def read_and_deconvolve(
     read: Callable[[], Image],
@@ -285,7 +303,7 @@ def read_and_deconvolve(
     Raises DataError "too-much-memory", "plate-scale-known", "plate-scale-mismatch", "channel-mismatch" and the errors
     of `check_exposure_of_sun`, of the source and of `deconvolve`.
     """
-    box, prepared = options.region, source.prepared
+    box = options.region
 
     def check_plane(plane: tuple[int, int]) -> None:
         if shape is None:
@@ -301,11 +319,11 @@ def read_and_deconvolve(
         )
         check_memory(plane, product_bytes(demand, shape[0] * shape[1]), free_bytes)
 
-    def as_built() -> Psf:
+    def load() -> Psf:
         if (source.key is not None and source.built is None) or shape is None:
-            return with_scale(source.load(header, None), source.plate_scale_arcsec)
+            return source.load(header, None)
         with compiling_beside(options.method, shape):
-            return with_scale(source.load(header, begin(BUILDING, 1)), source.plate_scale_arcsec)
+            return source.load(header, begin(BUILDING, 1))
 
     if shape is not None:
         check_plane(shape if box is None else box.wider(EXPECTED_RIM_PX, shape).shape)
@@ -313,15 +331,7 @@ def read_and_deconvolve(
     header = image.header
     if not again:
         check_exposure_of_sun(header)
-    of_telescope = known_instrument(header), frame_of(header).turn_to_build_deg
-    key = (of_telescope if source.key is None else source.key, source.plate_scale_arcsec)
-    # A build takes a minute, so what the instrument file says is compared first.
-    origin = source.built or source.seen_as(prepared.as_built(key, as_built))
-    channel = check_channel(origin, header, other_channel=source.other_channel)
-    if source.built is not None:
-        binning_factor(with_scale(source.built, source.plate_scale_arcsec), header)
-    whole = prepared.as_built(key, as_built)
-    fitted = prepared.on_pixels_of(header, key, as_built)
+    whole, fitted, channel = source.on_pixels_of(header, load)
     warnings = {
         **source.warnings,
         **input_warnings(source.seen_as(fitted), image, options.method, channel=channel),
@@ -331,7 +341,7 @@ def read_and_deconvolve(
     product = deconvolve(
         clip(image),
         fitted,
-        replace(options, engine_for=prepared.engine_for),
+        replace(options, engine_for=source.prepared.engine_for),
         warnings=warnings,
         possible_psfs=lambda: source.possible_psfs(whole, header),
         begin=begin,

@@ -12,6 +12,7 @@ import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -21,11 +22,15 @@ from pydantic import TypeAdapter, ValidationError
 from psfcore import limited
 from psfcore.compiled import listening
 from psfcore.deconvolve.box import Box
+from psfcore.deconvolve.declaration import Edges
+from psfcore.deconvolve.forward import Convolved, convolve_image
+from psfcore.deconvolve.run import UsedPsf
 from psfcore.errors import DataError
 from psfcore.files import sha256_of
 from psfcore.fits.blocks import LIMITS
 from psfcore.fits.frame import frame_of
 from psfcore.fits.header import check_not_deconvolved, read_summary
+from psfcore.fits.observation import read_observation
 from psfcore.fits.psfs import stated_id
 from psfcore.fits.stored_psf import check_no_product
 from psfcore.gap.effect_sources import sha256_of_source
@@ -197,6 +202,22 @@ class Local(Operations):
     def release(self, product: dict[str, Any]) -> None:
         """Forget a product, which would use memory otherwise."""
         del self.inputs.results[ResultType.PRODUCT, product["id"]]
+
+    def convolve(
+        self, image_id: str, edges: Edges, report: Progress, **named: Any
+    ) -> tuple[Convolved, UsedPsf]:
+        """Convolve an image with a PSF; returns also how cards name the PSF. named: further fields of the request for a
+        deconvolution of the image, such as ``psf_id``.
+        """
+        request = self._resolved_deconvolution(Deconvolve(image_id=image_id, again=True, **named))
+        workspace = self._workspace(image_id, report)
+        source = workspace.psf_source(request)
+        image = read_observation(workspace.image_file(image_id), LIMITS, hdu=request.hdu)
+        found = convolve_image(
+            image, source, edges=edges, threads=cores(), begin=lambda stage, _: partial(report, stage)
+        )
+        psf = found.psf
+        return found, source.used or UsedPsf(request.psf_id, psf.name, psf.version, psf.status)
 
     def _resolved(self, kind: str, parameters: dict[str, Any]) -> tuple[Any, str]:
         """The resolved parameters of a request, and the id of its result."""

@@ -149,6 +149,7 @@ SECTIONS = {
     "Images": {
         "deconvolve": Lazy("service.cli.deconvolve", "deconvolve", "Deconvolve images."),
         "changes": Lazy("service.cli.deconvolve", "changes", "Deconvolve images and show what changed."),
+        "convolve": Lazy("service.cli.convolve", "convolve", "Convolve a model image with a PSF."),
         "product": Lazy("service.cli.jobs", "product", "List, download and delete products."),
     },
     "PSFs": {

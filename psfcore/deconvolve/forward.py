@@ -1,0 +1,119 @@
+"""What a telescope records of a model image: the image convolved with the PSF of the telescope, on its own pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore import software_version
+from psfcore.convolution.engine import Engine
+from psfcore.deconvolve.conditions import Progress
+from psfcore.deconvolve.declaration import Edges
+from psfcore.deconvolve.doubts import input_warnings
+from psfcore.deconvolve.edges import lay_out, margin_for, share_from_beyond
+from psfcore.deconvolve.run import BUILDING, Cards, PsfSource, UsedPsf
+from psfcore.errors import DataError
+from psfcore.fits.images import write_image
+from psfcore.image import Image
+from psfcore.psf import Psf
+
+EDGES: tuple[Edges, ...] = ("zero", "symmetric")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Convolved:
+    """A model image as a telescope records it.
+
+    pixels: [y, x] in the unit of the image; NaN where the image has no finite value. image: the model image. psf: the
+    PSF on the pixels of the image. edges: the assumed scene beyond the image. warnings: sentences by their codes.
+    """
+
+    pixels: NDArray[np.float64]
+    image: Image
+    psf: Psf
+    edges: Edges
+    warnings: Mapping[str, str]
+
+    def cards_for(self, psf: UsedPsf) -> Cards:
+        """The cards that say how the image was convolved. They differ from those of a product, so that the result can
+        be deconvolved as an image of the telescope. psf: as the cards name it.
+        """
+        return {
+            "CNVPSFID": (psf.id, ""),
+            "CNVPSFN": (psf.name, "name of the PSF of the convolution"),
+            "CNVPSFV": (psf.version, "version of this PSF"),
+            "CNVEDGE": (self.edges, "assumed scene beyond the edges"),
+            "SWHELIO": (software_version(), "heliopsf version"),
+        }
+
+    def history_for(self, psf: UsedPsf) -> list[str]:
+        """The lines of HISTORY."""
+        return [
+            f"heliopsf {software_version()}: convolved with PSF {psf.name} {psf.version} ({psf.status}), "
+            f"edges {self.edges}",
+            *(f"WARNING ({code}): {message}" for code, message in self.warnings.items()),
+        ]
+
+    def lines_for(self, psf: UsedPsf) -> list[str]:
+        """Two lines: the PSF and the edges; the shape, the brightest pixel and the light that stays in the field."""
+        ny, nx = self.pixels.shape
+        before, after = (plane[self.image.finite] for plane in (self.image.pixels, self.pixels))
+        kept = (
+            f"; {100 * after.sum() / before.sum():.4g} % of the light stays in the field"
+            if before.sum() > 0
+            else ""
+        )
+        return [
+            f"convolved with PSF {psf.name} {psf.version}, edges {self.edges}",
+            f"{nx} x {ny} px; brightest pixel {before.max():.4g} before, {after.max():.4g} after{kept}",
+        ]
+
+    def write_as(self, path: Path, psf: UsedPsf) -> None:
+        """Write a FITS file. psf: as the cards name it."""
+        image = replace(self.image, pixels=self.pixels)
+        write_image(path, image, cards=self.cards_for(psf), history=self.history_for(psf))
+
+
+def convolve(image: Image, psf: Psf, *, edges: Edges = "zero", threads: int = 1) -> NDArray[np.float64]:
+    """Convolve an image with a PSF: H x of Eq. (1) in `psfcore.convolution.convolver`. Returns the pixels [y, x].
+
+    psf: the PSF on the pixels of the image. edges: the scene beyond the image, "zero" or "symmetric" (its mirror
+    image, as far as light reaches). Pixels without a value send no light, and stay without one.
+    Raises DataError "bad-edges", "all-masked" and "no-signal".
+    """
+    if edges not in EDGES:
+        raise DataError(
+            "bad-edges", f"expected edges zero or symmetric, the scene beyond the image; got {edges!r:.60}"
+        )
+    ny, nx = image.pixels.shape
+    margin_px = margin_for(share_from_beyond(psf), (ny, nx), share=0.0)
+    domain = lay_out(image, edges=edges, margin_px=margin_px)
+    engine = Engine(psf.kernel, domain.shape, span=domain.shape, threads=threads)
+    pixels = domain.cut([(0, engine.apply(domain.pixels))])
+    pixels[~image.finite] = np.nan
+    return pixels
+
+
+def convolve_image(
+    image: Image,
+    source: PsfSource,
+    *,
+    edges: Edges = "zero",
+    threads: int = 1,
+    begin: Callable[[str, int], Progress | None] = lambda stage, steps: None,
+) -> Convolved:
+    """Convolve an image with the PSF of a source, which is brought onto the pixels of the image.
+
+    begin: see `psfcore.deconvolve.run.deconvolve`. Raises DataError "plate-scale-known", "plate-scale-mismatch",
+    "channel-mismatch", and the errors of the source and of `convolve`.
+    """
+    _, fitted, channel = source.on_pixels_of(
+        image.header, lambda: source.load(image.header, begin(BUILDING, 1))
+    )
+    warnings = {**source.warnings, **input_warnings(source.seen_as(fitted), image, None, channel=channel)}
+    pixels = convolve(image, fitted, edges=edges, threads=threads)
+    return Convolved(pixels=pixels, image=image, psf=fitted, edges=edges, warnings=warnings)
