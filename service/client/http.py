@@ -345,7 +345,7 @@ class Client(Connection, Operations):
                     if share is None:
                         progress(done["stage"], done["step"], max(done["steps"], 1))
                     else:
-                        progress(done["stage"], round(100 * share), 100)
+                        progress(done["stage"], int(100 * share), 100)
         except KeyboardInterrupt as stop:
             raise WaitInterrupted("job", job["id"], self.server) from stop
         return self._ended(now)
