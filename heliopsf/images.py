@@ -224,7 +224,7 @@ def convolve(
     threads: int | None = None,
     progress: Progress = None,
 ) -> Any:
-    """Convolve a model image with a PSF: what the telescope would record. The result has the form of the image.
+    """Convolve a model image with a PSF. The result has the form of the image.
 
         >>> recorded = heliopsf.convolve(model, "aia_171")
 
@@ -239,8 +239,16 @@ def convolve(
         The scene beyond the image: dark, or its mirror image.
     full : bool
         Return a ``Convolution`` for every form of image.
-    hdu, plate_scale_arcsec, other_channel, threads, progress
-        As in ``heliopsf.Options``.
+    hdu : int, optional
+        Number of the HDU with the image. Default: the first image.
+    plate_scale_arcsec : float or Quantity, optional
+        Plate scale of a PSF that gives none, arcsec/px.
+    other_channel : bool
+        Whether the PSF may be of another telescope, channel or filter than the image.
+    threads : int, optional
+        Number of threads. Default: all cores.
+    progress : bool, optional
+        True: show a line while the PSF is built.
 
     Returns
     -------

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from heliopsf.inputs import hdu_of, is_hdu, is_map, is_nddata, is_pair
 from heliopsf.psfs import Psf, Shown
+from psfcore.deconvolve import forward
 from psfcore.deconvolve.forward import Convolved
 from psfcore.deconvolve.run import Cards, Product, UsedPsf, deconvolution_cards, deconvolution_history
 from psfcore.deconvolve.summary import summary_lines
@@ -108,17 +109,6 @@ class Deconvolution(Shown, Product):
     def changes(self) -> dict[str, Any]:
         """The measured changes: flux, bright and dark structures, and signs of artefacts (JSON)."""
         return self.assessed.changes.as_json()
-
-    def cards(self) -> Cards:
-        """The cards of the result in the form of the user's image."""
-        passes = passes_of(self.image.header) + 1
-        return deconvolution_cards(self, used_psf(self.psf)) | {
-            CARD_OF_PASS: (passes, "deconvolutions of this image, with this one")
-        }
-
-    def history(self) -> list[str]:
-        """The lines of HISTORY."""
-        return deconvolution_history(self, used_psf(self.psf))
 
     def lines(self) -> list[str]:
         """Describe the result in two lines.
@@ -223,14 +213,6 @@ class Convolution(Shown, Convolved):
         """No planes, unlike a ``Deconvolution``."""
         return {}
 
-    def cards(self) -> Cards:
-        """The cards of the result in the form of the user's image."""
-        return self.cards_for(used_psf(self.psf))
-
-    def history(self) -> list[str]:
-        """The lines of HISTORY."""
-        return self.history_for(used_psf(self.psf))
-
     def lines(self) -> list[str]:
         """Describe the result in two lines.
 
@@ -239,7 +221,7 @@ class Convolution(Shown, Convolved):
         list of str
             PSF and edges; then shape, brightest pixel, and the share of the light that stays in the field.
         """
-        return self.lines_for(used_psf(self.psf))
+        return forward.lines(self, used_psf(self.psf))
 
     def quicklook(self) -> Figure:
         """Draw the image before and after, and the change.
@@ -285,7 +267,7 @@ class Convolution(Shown, Convolved):
             The file cannot be written.
         """
         with whole_path(Path(path)) as file:
-            self.write_as(file, used_psf(self.psf))
+            forward.write(self, file, used_psf(self.psf))
 
 
 def in_form_of(image: Any, result: Deconvolution | Convolution) -> Any:
@@ -324,6 +306,15 @@ def used_psf(psf: Psf) -> UsedPsf:
     if identity is None:  # weights in memory
         identity = hashlib.sha256(f"{psf.kernel.shape}".encode() + psf.kernel.tobytes()).hexdigest()
     return UsedPsf(str(identity), psf.name, psf.version, psf.status)
+
+
+def _cards_and_history(result: Deconvolution | Convolution) -> tuple[Cards, list[str]]:
+    used = used_psf(result.psf)
+    if isinstance(result, Convolution):
+        return forward.cards(result, used), forward.history(result, used)
+    passes = passes_of(result.image.header) + 1
+    own = {CARD_OF_PASS: (passes, "deconvolutions of this image, with this one")}
+    return deconvolution_cards(result, used) | own, deconvolution_history(result, used)
 
 
 def _as_map(image: Any, result: Deconvolution | Convolution) -> Any:
@@ -367,9 +358,9 @@ def _described(of_image: Any, result: Deconvolution | Convolution) -> Any:
     is_header = isinstance(meta, Header)
     for key in [key for key in meta if _REMOVED.fullmatch(str(key))]:
         del meta[key]
-    for key, (value, comment) in result.cards().items():
+    cards, lines = _cards_and_history(result)
+    for key, (value, comment) in cards.items():
         meta[key] = (value, comment) if is_header else value
-    lines = result.history()
     if is_header:
         for line in lines:
             meta.add_history(line)

@@ -38,44 +38,48 @@ class Convolved:
     edges: Edges
     warnings: Mapping[str, str]
 
-    def cards_for(self, psf: UsedPsf) -> Cards:
-        """The cards that say how the image was convolved. They differ from those of a product, so that the result can
-        be deconvolved as an image of the telescope. psf: as the cards name it.
-        """
-        return {
-            "CNVPSFID": (psf.id, ""),
-            "CNVPSFN": (psf.name, "name of the PSF of the convolution"),
-            "CNVPSFV": (psf.version, "version of this PSF"),
-            "CNVEDGE": (self.edges, "assumed scene beyond the edges"),
-            "SWHELIO": (software_version(), "heliopsf version"),
-        }
 
-    def history_for(self, psf: UsedPsf) -> list[str]:
-        """The lines of HISTORY."""
-        return [
-            f"heliopsf {software_version()}: convolved with PSF {psf.name} {psf.version} ({psf.status}), "
-            f"edges {self.edges}",
-            *(f"WARNING ({code}): {message}" for code, message in self.warnings.items()),
-        ]
+def cards(found: Convolved, psf: UsedPsf) -> Cards:
+    """The cards that say how the image was convolved. They differ from those of a product, so that the result can
+    be deconvolved as an image of the telescope. psf: as the cards name it.
+    """
+    return {
+        "CNVPSFID": (psf.id, ""),
+        "CNVPSFN": (psf.name, "name of the PSF of the convolution"),
+        "CNVPSFV": (psf.version, "version of this PSF"),
+        "CNVEDGE": (found.edges, "assumed scene beyond the edges"),
+        "SWHELIO": (software_version(), "heliopsf version"),
+    }
 
-    def lines_for(self, psf: UsedPsf) -> list[str]:
-        """Two lines: the PSF and the edges; the shape, the brightest pixel and the light that stays in the field."""
-        ny, nx = self.pixels.shape
-        before, after = (plane[self.image.finite] for plane in (self.image.pixels, self.pixels))
-        kept = (
-            f"; {100 * after.sum() / before.sum():.4g} % of the light stays in the field"
-            if before.sum() > 0
-            else ""
-        )
-        return [
-            f"convolved with PSF {psf.name} {psf.version}, edges {self.edges}",
-            f"{nx} x {ny} px; brightest pixel {before.max():.4g} before, {after.max():.4g} after{kept}",
-        ]
 
-    def write_as(self, path: Path, psf: UsedPsf) -> None:
-        """Write a FITS file. psf: as the cards name it."""
-        image = replace(self.image, pixels=self.pixels)
-        write_image(path, image, cards=self.cards_for(psf), history=self.history_for(psf))
+def history(found: Convolved, psf: UsedPsf) -> list[str]:
+    """The lines of HISTORY."""
+    return [
+        f"heliopsf {software_version()}: convolved with PSF {psf.name} {psf.version} ({psf.status}), "
+        f"edges {found.edges}",
+        *(f"WARNING ({code}): {message}" for code, message in found.warnings.items()),
+    ]
+
+
+def lines(found: Convolved, psf: UsedPsf) -> list[str]:
+    """Two lines: the PSF and the edges; the shape, the brightest pixel and the light that stays in the field."""
+    ny, nx = found.pixels.shape
+    before, after = (plane[found.image.finite] for plane in (found.image.pixels, found.pixels))
+    kept = (
+        f"; {100 * after.sum() / before.sum():.4g} % of the light stays in the field"
+        if before.sum() > 0
+        else ""
+    )
+    return [
+        f"convolved with PSF {psf.name} {psf.version}, edges {found.edges}",
+        f"{nx} x {ny} px; brightest pixel {before.max():.4g} before, {after.max():.4g} after{kept}",
+    ]
+
+
+def write(found: Convolved, path: Path, psf: UsedPsf) -> None:
+    """Write a FITS file. psf: as the cards name it."""
+    image = replace(found.image, pixels=found.pixels)
+    write_image(path, image, cards=cards(found, psf), history=history(found, psf))
 
 
 def convolve(image: Image, psf: Psf, *, edges: Edges = "zero", threads: int = 1) -> NDArray[np.float64]:

@@ -117,6 +117,14 @@ class Diagnosis:
         return tuple(e for e in self.evidence.effects if e.name in self.answer.named)
 
 
+STAGES = (
+    "fit",
+    "model of the gap",
+    "hypotheses",
+    "full refit",
+)  # the last one only if `refit`, and a cause is told
+
+
 def diagnose(
     transit: Transit,
     *,
@@ -148,10 +156,13 @@ def diagnose(
     noise = measured_noise(transit)
     if noise is not None and not noise.agrees:
         transit = replace(transit, noise=noise.noise)
-    solution = solution_of(transit, shape, solution, start=start, threads=threads, progress=progress)
+    of_fit, of_model, of_hypotheses, of_refit = (
+        labelled(progress, f"{stage} ({n} of {4 if refit else 3})") for n, stage in enumerate(STAGES, start=1)
+    )
+    solution = solution_of(transit, shape, solution, start=start, threads=threads, progress=of_fit)
     view = View(solution)
-    model, expected = linear_model_of(view, library, seed=seed, progress=progress)
-    progress("hypotheses", 0, 1)
+    model, expected = linear_model_of(view, library, seed=seed, progress=of_model)
+    of_hypotheses("comparing", 0, 1)
     return_unused_memory()  # of the simulated transit and its fit
     answer = answer_of(model, level)
     rng = np.random.default_rng(seed)
@@ -168,7 +179,7 @@ def diagnose(
         and answer.verdict in ("attributed", "tie")
         and set(told.names) <= set(effects)
     ):
-        corrected = _refit(view, model, [effects[name] for name in told.names], told, failures, progress)
+        corrected = _refit(view, model, [effects[name] for name in told.names], told, failures, of_refit)
     schemes = (time_blocks(model), pointings(model))
     held_out = [hold_out(model, (), scheme) for scheme in schemes]
     closing = partial(_shrinking, held_out, schemes, rng, bool(answer.causes))
@@ -271,7 +282,7 @@ def _refit(
     """The full refit with these effects; None, and a sentence in `failures`, if it fails."""
     label = label_of(fit.names)
     try:
-        told = labelled(progress, f"full refit with {label}")
+        told = labelled(progress, label)
         return add_to_model(view.solution, effects, fit, model, view=view, progress=told)
     except DataError as error:  # the fit may fail if the subtracted effect is not in the images
         failures.append(f"The full refit with {label} in the model failed: {error}")

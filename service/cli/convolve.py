@@ -43,6 +43,7 @@ def convolve(
 
     The PSF is brought onto the pixels of the image. The command runs in this process.
     """
+    from psfcore.deconvolve.forward import lines, write
     from service.cli.local import local
 
     psf_files = [Path(psf)] if psf and Path(psf).is_file() else []
@@ -51,15 +52,15 @@ def convolve(
         parameters |= {"psf_id": named_psf(here, psf)}
         found, used = here.convolve(str(here.upload_image(image)["id"]), edges, report, **parameters)
         with written(output, overwrite=overwrite) as file:
-            found.write_as(file, used)
+            write(found, file, used)
         if plot is not None:
             from psfcore.drawing.plots import preview_png
             from psfcore.fits.units import unit_label
 
-            first, _ = found.lines_for(used)
+            first, _ = lines(found, used)
             with written(plot, overwrite=overwrite) as file:
                 preview_png(found.image.pixels, found.pixels, file, title=first, unit=unit_label(found.image))
     for message in found.warnings.values():
         echo(f"warning: {message}", err=True)
-    first, *others = found.lines_for(used)
+    first, *others = lines(found, used)
     echo("\n".join([f"{output}: {first}", *others]))

@@ -22,7 +22,7 @@ OFF = {
     "SA01": "the reference shows related names together",
 }
 # Classes that only the package makes: their fields are attributes, not parameters (PR01).
-RESULTS = (heliopsf.Deconvolution, heliopsf.GapDiagnosis, heliopsf.ScatterFit)
+RESULTS = (heliopsf.Convolution, heliopsf.Deconvolution, heliopsf.GapDiagnosis, heliopsf.ScatterFit)
 
 
 def _names() -> Iterator[str]:

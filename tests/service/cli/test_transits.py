@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+import re
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,7 @@ from tests.html_page import check_stands_alone, read_page
 from tests.service.conftest import result_of, upload
 from tests.transit_files import TRUTH, diffraction, write_simulated
 from workers.tasks import gap as gap_task
+from workers.tasks.workspace import Progress
 
 
 @pytest.fixture(scope="module")
@@ -124,16 +126,21 @@ class Diagnosed:
     done: Result
     out: Path
     found: Diagnosis
+    stages: Sequence[str]
 
 
 @pytest.fixture(scope="module")
 def diagnosed(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Diagnosed:
     """Nothing is patched but the library's length; the light that the file describes is in the images."""
-    out, made = tmp_path_factory.mktemp("diagnosed"), []
+    out, made, stages = tmp_path_factory.mktemp("diagnosed"), [], list[str]()
     (out / "mine.py").write_text(EDGE_GLOW)
 
-    def kept(*given: Any, **how: Any) -> Diagnosis:
-        made.append(diagnose(*given, **how))
+    def kept(*given: Any, progress: Progress, **how: Any) -> Diagnosis:
+        def told(stage: str, step: int, steps: int) -> None:
+            stages.append(stage)
+            progress(stage, step, steps)
+
+        made.append(diagnose(*given, progress=told, **how))
         return made[0]
 
     with quick_diagnosis(), patch.object(gap_task, "diagnose", kept):
@@ -142,7 +149,13 @@ def diagnosed(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Diagnos
             "--plot", out / "g.png", "--corrected", out / "psf.fits",
         )  # fmt: skip
     assert done.exit_code == 0, done.output
-    return Diagnosed(done, out, made[0])
+    return Diagnosed(done, out, made[0], stages)
+
+
+def test_the_stages_are_numbered_in_their_order(diagnosed: Diagnosed) -> None:
+    numbers = [found[0] for stage in diagnosed.stages if (found := re.findall(r"\((\d) of 4\): ", stage))]
+    assert len(numbers) == len(diagnosed.stages) and numbers == sorted(numbers)
+    assert set(numbers) == {"1", "2", "3", "4"}
 
 
 def test_an_effect_of_one_s_own_is_found_with_its_size(diagnosed: Diagnosed) -> None:
