@@ -28,13 +28,13 @@ class DataError(ValueError):
         Further facts for programs, as JSON values.
     """
 
-    def __init__(self, code: str, message: str, fields: Mapping[str, Any] | None = None) -> None:
+    def __init__(self, code: str, message: str, fields: Mapping[str, object] | None = None) -> None:
         super().__init__(f"{code}: {message}")
         self.code = code
         self.message = message
         self.fields = dict(fields or {})
 
-    def __reduce__(self) -> tuple[type[DataError], tuple[str, str, dict[str, Any]]]:
+    def __reduce__(self) -> tuple[type[DataError], tuple[str, str, dict[str, object]]]:
         return type(self), (self.code, self.message, self.fields)
 
 

@@ -78,7 +78,7 @@ class CameraNoise(Noise):
             texts = [f"{value:.3g} +- {error:.1g}" for value, error in zip(figures, self.sigma, strict=True)]
         return f"photon gain {texts[0]} DN, read noise {texts[1]} DN, {self.source} ({self.basis})"
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, object]:
         """The figures and their source."""
         figures = {"photon_gain_dn": self.photon_gain_dn, "read_noise_dn": self.read_noise_dn}
         return {**figures, "source": self.source, "sigma": self.sigma, "text": str(self)}

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,7 +73,7 @@ class Patterns:
     """The pattern of each component (the share of all light in each pixel), and notes on how it was computed."""
 
     kernels: dict[str, Kernel] = field(default_factory=dict)
-    notes: dict[str, Any] = field(default_factory=dict)
+    notes: dict[str, object] = field(default_factory=dict)
 
 
 def route_of(instrument: Instrument) -> Route:
@@ -167,6 +167,20 @@ def diffraction_patterns(
     return patterns
 
 
+class _Optics(TypedDict):
+    wavelength_angstrom: float
+    focal_length_mm: float
+    pixel_pitch_um: float
+    size: int
+
+
+class _Series(TypedDict):
+    pitch_um: float
+    wire_um: float
+    windows: int
+    size: int
+
+
 @dataclass
 class _OneWavelength:
     """All components at one wavelength, each computed from the aperture or from earlier components."""
@@ -177,7 +191,7 @@ class _OneWavelength:
     size: int
     mount_image: NDArray[np.floating] | None
     threads: int
-    notes: dict[str, Any]
+    notes: dict[str, object]
     kernels: dict[str, Kernel] = field(default_factory=dict)
 
     def kernel(self, name: str, progress: Progress) -> Kernel:
@@ -209,7 +223,7 @@ class _OneWavelength:
         aperture = self.instrument.aperture
         if self.route.mask and not aperture.round:
             return self._far_field(AIRY, (), None, progress)
-        optics: dict[str, Any] = {
+        optics: _Optics = {
             "wavelength_angstrom": self.wavelength_angstrom,
             "focal_length_mm": self.instrument.focal_length_mm,
             "pixel_pitch_um": self.instrument.detector.pixel_pitch_um,
@@ -272,7 +286,7 @@ class _OneWavelength:
             pitch_um=mesh.pitch_um,
             pixel_pitch_um=self.instrument.detector.pixel_pitch_um,
         )
-        series: dict[str, Any] = {
+        series: _Series = {
             "pitch_um": mesh.pitch_um,
             "wire_um": mesh.wire_um,
             "windows": windows_of(mesh),

@@ -204,7 +204,7 @@ def _decoded_pixels(
 
 def decode_tiles(
     target: BinaryIO, *, path: str, number: int, shape: list[int], twice: bool
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Write the pixels of a tile-compressed image to ``target``; returns the type of its numbers, and whether DATASUM
     contradicts its tiles.
 

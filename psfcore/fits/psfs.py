@@ -189,7 +189,7 @@ def stated_id(path: str | Path, limits: FitsLimits) -> str | None:
     return stated[0] if good else None
 
 
-def check_written(_target: BinaryIO, *, path: str, count: int) -> dict[str, Any]:
+def check_written(_target: BinaryIO, *, path: str, count: int) -> dict[str, object]:
     """Whether the first HDUs of a file are as `write_psf` wrote them ("good"). Call it in a limited process
     (`psfcore.limited`).
     """
@@ -216,13 +216,13 @@ def _read_extras(
     return components, extras["provenance"], None if fitted is None else _fitted(**fitted)
 
 
-def write_extras(target: BinaryIO, *, path: str, count: int, shape: list[int]) -> dict[str, Any]:
+def write_extras(target: BinaryIO, *, path: str, count: int, shape: list[int]) -> dict[str, object]:
     """Write the components of a PSF to ``target``, float64; returns their names, the provenance and the fitted shape.
 
     HDUs that `write_psf` never writes are ignored: compressed components, components of another shape, and tables with
     data outside their rows. Call it in a limited process (`psfcore.limited`).
     """
-    provenance: dict[str, Any] = {}
+    provenance: dict[str, object] = {}
     extras: dict[str, Any] = {"components": [], "provenance": provenance, "fitted": None}
     with readable_pixels(path, "the extensions"), _first_hdus(path, count) as hdus:
         provenance["history"] = [str(line) for line in hdus[0].header.get("HISTORY", [])]

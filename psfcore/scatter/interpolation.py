@@ -118,7 +118,7 @@ def interpolated_psf(
     *,
     name: str,
     version: str,
-    provenance: Mapping[str, Any],
+    provenance: Mapping[str, object],
     threads: int = 1,
 ) -> Psf:
     """The total PSF at a time between two epochs, on the array of the two PSFs, with its components and its errors.
@@ -180,7 +180,7 @@ def interpolated_psf(
     )
 
 
-def parameters_of(fitted: FittedShape) -> dict[str, dict[str, Any]]:
+def parameters_of(fitted: FittedShape) -> dict[str, dict[str, float | str]]:
     """The parameters of a fitted shape by name: value, standard error (sigma), unit and meaning."""
     shape, at = shape_named(fitted.shape), np.array(fitted.coordinates)
     return shape.described(shape.values(at), shape.value_sigma(at, np.array(fitted.covariance)))

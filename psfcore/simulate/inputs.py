@@ -174,7 +174,7 @@ def _exposures_of_headers(
     return rows
 
 
-def _size_of_manifest(content: Mapping[str, Any]) -> int:
+def _size_of_manifest(content: Mapping[str, object]) -> int:
     size = content.get("size_px")
     if not isinstance(size, int) or isinstance(size, bool):
         raise _bad(
@@ -210,7 +210,7 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _views(content: Mapping[str, Any], count: int) -> tuple[str, ...]:
+def _views(content: Mapping[str, object], count: int) -> tuple[str, ...]:
     """The view of each pointing, as the file states it.
 
     Default: three pointings show the east limb, the disc and the west limb; with any other number, all pointings show

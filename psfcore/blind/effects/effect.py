@@ -156,7 +156,7 @@ class Effect:
 
     kind: EffectKind
     strength: float
-    parameters: Mapping[str, Any]
+    parameters: Mapping[str, object]
 
     def __getitem__(self, name: str) -> Any:
         """The parameter with this name."""
@@ -166,7 +166,7 @@ class Effect:
         """The same effect with another strength."""
         return replace(self, strength=strength)
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, object]:
         """The effect for the truth of a case. cause: its name in the gap library; None if the library does not
         contain it.
         """

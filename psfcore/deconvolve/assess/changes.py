@@ -107,7 +107,7 @@ class Changes:
     ranges: tuple[Range, ...]
     artefacts: Artefacts
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, object]:
         """Values for JSON, without the plane of suspected pixels."""
         plain = {name: value for name, value in vars(self).items() if name not in ("structures", "ranges")}
         return plain | {

@@ -91,7 +91,7 @@ def write_cutout(path: str | Path, region: Region, limits: FitsLimits, target: B
     )
 
 
-def cut_out(target: BinaryIO, *, path: str, frame: Frame, edge: list[list[float]]) -> dict[str, Any]:
+def cut_out(target: BinaryIO, *, path: str, frame: Frame, edge: list[list[float]]) -> dict[str, object]:
     """Write the cut-out of a product to ``target``. Call it in a limited process (`psfcore.limited`)."""
     with readable_pixels(path, "the region"), fits.open(path, memmap=False) as hdus:
         image = hdus[0]

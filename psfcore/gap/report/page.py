@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 import sys
-from typing import Any
 
 from psfcore.drawing.numbers import DASH, with_error
 from psfcore.drawing.page import Page, render
@@ -25,10 +24,10 @@ from psfcore.gap.report.report import (
     percent_words,
     words,
 )
+from psfcore.gap.schema import GapReport, IntervalJson
 from psfcore.gap.verdict.axes import SIGN_FLIPS
 from psfcore.gap.verdict.correction import ROUNDS
 
-Report = dict[str, Any]
 Row = list[str]
 
 VERDICTS = {
@@ -41,7 +40,7 @@ VERDICTS = {
 MOST_HYPOTHESES = 8
 
 
-def gap_page(found: Diagnosis, report: Report) -> Page:
+def gap_page(found: Diagnosis, report: GapReport) -> Page:
     """The page of a diagnosis. report: its report (schema gap/3).
 
     The optional entry "provenance" of the report states the software, the libraries, the seed and the PSF at which the
@@ -69,7 +68,7 @@ def gap_page(found: Diagnosis, report: Report) -> Page:
     )
 
 
-def interval_words(interval: dict[str, Any]) -> str:
+def interval_words(interval: IntervalJson) -> str:
     """A value with its 90 % interval, "5.1 (4.4 to 5.9)"."""
     value, low, high = (round(one, 1) + 0.0 for one in (interval["value"], *interval["ci90"]))
     return f"{value:.1f} ({low:.1f} to {high:.1f})"
@@ -80,7 +79,7 @@ def unit_words(unit: str) -> str:
     return re.sub(r"(?<=[a-z])2\b", "²", unit)
 
 
-def cause_rows(report: Report) -> list[Row]:
+def cause_rows(report: GapReport) -> list[Row]:
     """Every alternative of every cause of the answer."""
     return [
         [
@@ -95,7 +94,7 @@ def cause_rows(report: Report) -> list[Row]:
     ]
 
 
-def hypothesis_rows(report: Report) -> list[Row]:
+def hypothesis_rows(report: GapReport) -> list[Row]:
     """The most probable hypotheses."""
     return [
         [
@@ -107,11 +106,11 @@ def hypothesis_rows(report: Report) -> list[Row]:
     ]
 
 
-def effect_rows(report: Report) -> list[Row]:
+def effect_rows(report: GapReport) -> list[Row]:
     """Every effect that was tested, with its parameters and its closure."""
     rows = []
     for effect in fits_of(report):
-        parameters, fall, closure = (effect[key] for key in ("parameters", "delta_chi2_held_out", "closure"))
+        parameters, fall, closure = effect["parameters"], effect["delta_chi2_held_out"], effect["closure"]
         numbers = (
             f"{words(name)} {with_error(p['value'], p['sigma'])} {unit_words(p['unit'])}".rstrip()
             for name, p in parameters.items()
@@ -126,7 +125,7 @@ def effect_rows(report: Report) -> list[Row]:
     return rows
 
 
-def psf_table(found: Diagnosis, report: Report) -> tuple[Row, list[Row]]:
+def psf_table(found: Diagnosis, report: GapReport) -> tuple[Row, list[Row]]:
     """The parameters and 1 - encircled energy of the PSF, without and with the named effects."""
     fits = [one for one in (report["psf"]["refitted"], report["psf"]["with_answer"]) if one is not None]
     rows = []
@@ -151,12 +150,12 @@ def _compared(values: list[tuple[float, float]]) -> Row:
     return cells
 
 
-def untestable_rows(report: Report) -> list[Row]:
+def untestable_rows(report: GapReport) -> list[Row]:
     """The effects that these data cannot show, with the reasons."""
     return [[words(one["name"]), one["why"]] for one in report["untestable"]]
 
 
-def image_rows(report: Report) -> list[Row]:
+def image_rows(report: GapReport) -> list[Row]:
     """All images that the fit used."""
     return [
         [

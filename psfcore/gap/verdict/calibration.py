@@ -21,7 +21,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
-from typing import Any
 
 from psfcore.errors import DataError
 
@@ -38,7 +37,7 @@ class Calibration:
     """
 
     levels: tuple[float, ...]
-    about: Mapping[str, Any]
+    about: Mapping[str, object]
 
     def level(self, coverage: float = COVERAGE) -> float:
         """The level of a group of alternatives, Eq. (1). Raises DataError "bad-coverage" if there are too few cases."""
@@ -57,7 +56,7 @@ class Calibration:
         """The fraction of the simulated cases whose answer contains a true cause at this level."""
         return sum(one <= level for one in self.levels) / len(self.levels)
 
-    def to_json(self, level: float) -> dict[str, Any]:
+    def to_json(self, level: float) -> dict[str, object]:
         """For the gap report: how many cases, what they gave at this level, and how they were made."""
         return {"cases": len(self.levels), "covered": self.covered(level), **self.about}
 
