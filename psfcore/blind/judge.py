@@ -133,7 +133,7 @@ class Cause:
         limit = self.case.report.get("limits", {}).get(self.effect["name"])
         if parameter is None or limit is None:
             return None
-        own = limit if limit["parameter"] == parameter else limit.get("parameters", {}).get(parameter)
+        own = limit if limit.get("parameter") == parameter else limit.get("parameters", {}).get(parameter)
         excluded = None if own is None else own.get("excluded_95")
         return None if excluded is None else bool(abs(self.effect["strength"]) <= excluded)
 

@@ -163,9 +163,14 @@ def _panel(axes: Axes, study: DesignStudy, value: _Number) -> None:
         )
     if study.flown is not None:
         axes.plot(
-            [study.flown.pitch_um], np.array([value(study.flown)], dtype=np.float64), marker="*",
-            markersize=13, color="#1b1b1b", linestyle="none", label=f"flown: pitch {study.flown.pitch_um:g}, wire {study.flown.wire_um:g} um",
-        )  # fmt: skip
+            [study.flown.pitch_um],
+            np.array([value(study.flown)], dtype=np.float64),
+            marker="*",
+            markersize=13,
+            color="#1b1b1b",
+            linestyle="none",
+            label=f"flown: pitch {study.flown.pitch_um:g}, wire {study.flown.wire_um:g} um",
+        )
     axes.set_xscale("log")
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
