@@ -27,7 +27,7 @@ from heliopsf.inputs import (
 )
 from heliopsf.outputs import Deconvolution, in_form_of
 from heliopsf.parameters import Options, Progress, Steps, noise_of, number, reporter, whole
-from heliopsf.psfs import AnyPsf, Psf, built_psf, given_psf
+from heliopsf.psfs import AnyPsf, Psf, built_psf, given_psf, instrument_named
 from psfcore.deconvolve.camera_noise import measured_noise
 from psfcore.deconvolve.conditions import PreparedPsfs
 from psfcore.deconvolve.doubts import input_warnings
@@ -35,6 +35,7 @@ from psfcore.deconvolve.methods.registry import properties_of
 from psfcore.deconvolve.run import BUILDING, DECONVOLVING, PsfSource, read_and_deconvolve
 from psfcore.deconvolve.work import Options as WorkOptions
 from psfcore.errors import DataError, DataWarning
+from psfcore.fits.channel import PsfOrigin, check_channel
 from psfcore.fits.frame import frame_of
 from psfcore.fits.header import seen_by
 from psfcore.image import Image
@@ -159,8 +160,16 @@ def deconvolve(
     if psf is None:
         of_image = source(partial(_built_for, threads=work.threads, parts=False))
     else:
-        own = given_psf(psf, threads=work.threads, progress=begin(BUILDING, 1))
-        of_image = source(lambda *_: own, key=id(own), kernel_shape=own.kernel.shape)
+        instrument = instrument_named(psf)
+        if instrument is None:
+            own = given_psf(psf, threads=work.threads, progress=None)
+            of_image = source(lambda *_: own, key=id(own), kernel_shape=own.kernel.shape)
+        else:
+            of_image = source(
+                lambda _, progress: given_psf(psf, threads=work.threads, progress=progress),
+                key=instrument.name,
+                built=PsfOrigin.of_instrument(instrument),
+            )
 
     def one(image: Any) -> Any:
         box = None if given.region is None else box_of(given.region, image, given.hdu)
@@ -234,7 +243,8 @@ def psf_for(image: Any, *, threads: int | None = None, progress: Progress = None
     with on_disk(image) as there:
         header = header_of(there)
     psf = _built_for(header, reporter(progress is True, BUILDING), threads=threads or cores(), parts=True)
-    for code, message in input_warnings(psf, _header_only(header), None, other_channel=False).items():
+    channel = check_channel(psf, header)
+    for code, message in input_warnings(psf, _header_only(header), None, channel=channel).items():
         warnings.warn(DataWarning(code, message), stacklevel=2)
     return Psf.of(psf_for_image(psf, header))
 

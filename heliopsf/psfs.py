@@ -21,7 +21,7 @@ from psfcore.fits.blocks import LIMITS
 from psfcore.fits.header import utc_time
 from psfcore.fits.images import read_mask_image
 from psfcore.instruments.files import instrument_names, instrument_path, turned_text
-from psfcore.instruments.model import load_instrument, read_instrument_text
+from psfcore.instruments.model import Instrument, load_instrument, read_instrument_text
 from psfcore.psf import Psf as CorePsf
 from psfcore.psf import cumulative_curve
 from psfcore.psf_cache import kept_psf
@@ -312,7 +312,7 @@ def given_psf(psf: Any, *, threads: int, progress: Steps | None) -> Psf:
     if isinstance(psf, CorePsf):
         return psf if isinstance(psf, Psf) else Psf.of(psf)
     if isinstance(psf, str | Path):
-        if str(psf).endswith(".toml") or (str(psf) in instrument_names() and not Path(psf).exists()):
+        if instrument_named(psf) is not None:
             return built_psf(psf, parts=False, threads=threads, progress=progress)
         if str(psf) in PUBLISHED and not Path(psf).exists():
             return read_psf(kept_file(published_folder(), str(psf)))
@@ -326,6 +326,17 @@ def given_psf(psf: Any, *, threads: int, progress: Steps | None) -> Psf:
         expected = "a Psf, a FITS file, an instrument (its name or file), or an array"
         raise DataError("bad-input", f"psf: expected {expected}; got {type(psf).__name__}") from None
     return Psf(kernel=kernel, name="array", version="unversioned", instrument=None, status="user")
+
+
+def instrument_named(psf: Any) -> Instrument | None:
+    """The instrument whose name or file (TOML) a user gives as the PSF; None for other PSFs.
+
+    Raises ``DataError`` of ``psfcore.instruments.model.load_instrument``.
+    """
+    if not isinstance(psf, str | Path):
+        return None
+    named = str(psf) in instrument_names() and not Path(psf).exists()
+    return load_instrument(psf) if named or str(psf).endswith(".toml") else None
 
 
 def existing_file(path: str | Path) -> Path:

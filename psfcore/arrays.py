@@ -38,7 +38,7 @@ Number = TypeVar("Number", bound=np.generic)
 WEAKEST_DIRECTION = 1e-15
 
 
-def json_values(value: Any) -> Any:
+def json_values(value: object) -> Any:
     """The JSON values of a result.
 
     Arrays become lists, mappings and dataclasses become objects, and nan and infinity become null, because JSON cannot

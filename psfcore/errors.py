@@ -24,7 +24,7 @@ class DataError(ValueError):
         A stable word in kebab-case for programs, such as "all-nan".
     message : str
         A sentence for people: what was expected, what was found, and what to do next.
-    fields : mapping of str to Any, optional
+    fields : mapping of str to object, optional
         Further facts for programs, as JSON values.
     """
 

@@ -29,6 +29,7 @@ file.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from astropy.io.fits import Header
@@ -36,13 +37,14 @@ from numpy.typing import NDArray
 
 from psfcore.errors import DataError
 from psfcore.fits.cards import Cards
-from psfcore.fits.channel import binning_factor
+from psfcore.fits.channel import PsfOrigin, binning_factor
 from psfcore.fits.frame import SILENT_DEG, UNIT, Matrix, frame_of, plate_scale_arcsec
 from psfcore.image import Image
 from psfcore.psf import LARGEST_SUM, PLATE_SCALE_TOLERANCE, REACH_GRID_PX, Psf, crop_centred
 
 LARGEST_FACTOR = 64
 Kernel = NDArray[np.float64]
+Scaled = TypeVar("Scaled", Psf, PsfOrigin)
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,7 @@ class Sampling:
         return turned(rebinned(psf, self.factor), self.turn)
 
 
-def with_scale(psf: Psf, plate_scale_arcsec: float | None) -> Psf:
+def with_scale(psf: Scaled, plate_scale_arcsec: float | None) -> Scaled:
     """The PSF with this plate scale, if its file gives none. Raises DataError "plate-scale-known" for another scale."""
     if plate_scale_arcsec is None or psf.plate_scale_arcsec == plate_scale_arcsec:
         return psf

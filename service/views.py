@@ -36,9 +36,6 @@ class PastChange(BaseModel):
     reason: str
 
 
-MOST_SHARE = 0.99  # a job that takes longer than estimated is not done yet
-
-
 class Progress(RowView):
     """Progress of a job."""
 
@@ -53,7 +50,7 @@ class Progress(RowView):
     share: float | None = Field(
         None,
         description="share of the estimated time of a job that counts several times, 0 to 1; null: the steps count "
-        "the whole job, or unknown",
+        "the whole job, or the estimated time has passed, or unknown",
     )
 
 
@@ -125,7 +122,7 @@ def time_left_s(row: JobRow, now: float | None = None) -> float | None:
     now = time.time() if now is None else now
     if not KINDS[row.kind].counted_whole:
         share = share_of_time(row, now)
-        if share is None or share >= MOST_SHARE or row.estimate is None:
+        if share is None or row.estimate is None:
             return None
         return float(row.estimate["seconds"] * (1 - share))
     done = row.step - row.count_step
@@ -135,15 +132,16 @@ def time_left_s(row: JobRow, now: float | None = None) -> float | None:
 
 
 def share_of_time(row: JobRow, now: float | None = None) -> float | None:
-    """The share of its estimated time that a running job has used, at most MOST_SHARE; None if its steps count the
-    whole job, or if no estimate is known. now: as for `time_left_s`.
+    """The share of its estimated time that a running job has used; None if its steps count the whole job, if the
+    estimate is not known or has passed, or if the stage has no steps. now: as for `time_left_s`.
     """
     if KINDS[row.kind].counted_whole or row.phase != Phase.EXECUTING or row.started_at is None:
         return None
-    if not row.estimate or not row.estimate["seconds"]:
+    if not row.estimate or not row.estimate["seconds"] or not row.steps:
         return None
     used_s = (time.time() if now is None else now) - row.started_at
-    return float(min(max(used_s / row.estimate["seconds"], 0.0), MOST_SHARE))
+    share = max(used_s / row.estimate["seconds"], 0.0)
+    return float(share) if share < 1 else None
 
 
 class ProductView(RowView):

@@ -49,9 +49,10 @@ print(report["cautions"] or "No cautions.")
 #
 # The report lists the causes that act together; here there is one. Each cause has one or more alternatives: one of them
 # is the cause. An alternative is an effect of the library, or another form of a family: a change of this kind whose
-# form the library does not have. The *level* of a cause says what is sure: the name of an effect, a family, a stage
+# form the library does not have. The *level* of a cause says what is told: the name of an effect, a family, a stage
 # (scene, optics or detector), or none of these (``open``). On transits like those of the calibration, the alternatives
-# contain a true cause with a probability of 90 % (``coverage``).
+# contain a true cause with a probability of 90 % (``coverage``); with effects of another author it was less, see the
+# results in :doc:`the gap diagnosis </gap>`.
 
 print("verdict:", report["verdict"])
 for cause in report["causes"]:
@@ -99,8 +100,9 @@ for name in ("dark_offset", "intensity_gradient", "column_smear", "ghost"):
 # ``gap.quicklook()`` draws the whole diagnosis, and ``heliopsf gap transit -o gap.html`` writes it as a page. What to
 # do next depends on the verdict:
 #
-# - ``attributed``: correct the cause, here the dark level, and fit again. ``heliopsf gap transit --corrected psf.fits``
-#   writes a PSF that was fitted with the effect in the model.
+# - ``attributed``: ``report["would_confirm"]`` names the observation that would confirm the cause. Correct it, here the
+#   dark level, and fit again. ``heliopsf gap transit --corrected psf.fits`` writes a PSF that was fitted with the
+#   effect in the model.
 # - ``tie``: ``report["would_separate"]`` names the observation that would separate the effects.
 # - ``none``: no gap was found. The limits state how strong an effect can still be.
 # - ``unknown`` or ``inconclusive``: at least one alternative is a form that the library does not have.

@@ -61,12 +61,19 @@ class OfBox:
     """How a box of an image was deconvolved alone (`psfcore.deconvolve.work`).
 
     box: the box in the pixels of the whole image. rim_px: largest width of the rim around it. error: bound of the
-    difference from the deconvolution of the whole image, in the unit of the image; 0: there is no difference.
+    difference from the deconvolution of the whole image, in the unit of the image; 0: there is no difference. mean: of
+    the valid pixels of the box in the image, in its unit.
     """
 
     box: Box
     rim_px: int
     error: float
+    mean: float
+
+    @property
+    def error_pct(self) -> float:
+        """The bound in percent of the mean of the box, as the option `region_error` gives it."""
+        return 100 * self.error / abs(self.mean) if self.error else 0.0
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from psfcore.convolution.offsets import needed_kernel
 from psfcore.deconvolve.methods.registry import method_names, properties_of
-from psfcore.fits.channel import check_channel
 from psfcore.fits.units import parse_unit
 from psfcore.image import Image
 from psfcore.instruments.files import instrument_names
@@ -39,13 +38,11 @@ _SAMPLE = 65_536
 _BESIDE = ((0, 1), (0, -1), (1, 0), (-1, 0))
 
 
-def input_warnings(psf: Psf, image: Image, method: str | None, *, other_channel: bool) -> dict[str, str]:
+def input_warnings(psf: Psf, image: Image, method: str | None, *, channel: str | None) -> dict[str, str]:
     """Warnings about the inputs: sentences by their codes, the most harmful first.
 
-    method: the method of the deconvolution; None: none was chosen yet. other_channel: whether the PSF may be of another
-    channel than the image. If it is of another channel and this is not allowed, raises DataError "channel-mismatch".
+    method: the method of the deconvolution; None: none was chosen yet. channel: the answer of `check_channel`.
     """
-    channel = check_channel(psf, image.header, other_channel=other_channel)
     warnings = frame_warnings(psf, image.header)
     warnings |= {} if channel is None else {"channel": channel}
     if _mesh_is_assumed(psf):

@@ -24,10 +24,10 @@ from psfcore.deconvolve.doubts import input_warnings
 from psfcore.deconvolve.kernels import compiling_beside
 from psfcore.deconvolve.memory import EXPECTED_RIM_PX, Demand, check_memory, product_bytes
 from psfcore.deconvolve.problem import no_noise_model
-from psfcore.deconvolve.summary import assumptions
+from psfcore.deconvolve.summary import assumptions, region_error
 from psfcore.deconvolve.work import Assessed, BoxWork, Options, Work, box_work
 from psfcore.fits.cards import optional_text
-from psfcore.fits.channel import check_channel
+from psfcore.fits.channel import PsfOrigin, binning_factor, check_channel
 from psfcore.fits.frame import frame_of
 from psfcore.fits.header import known_instrument
 from psfcore.fits.images import described, write_image
@@ -139,7 +139,7 @@ class Product(Deconvolved):
         ----------
         used : UsedPsf, optional
             The PSF as the cards of the result name it. Default: as its file names it.
-        provenance : mapping of str to Any, optional
+        provenance : mapping of str to object, optional
             How the PSF was made. Default: as its file says.
 
         Returns
@@ -170,7 +170,13 @@ class Product(Deconvolved):
             "chi2_per_pixel": self.chi2_per_pixel,
             "noise": self.noise and self.noise.as_json(),
             # The bound of the error is in the unit of the image, as is the saturation level.
-            "region": box and {"box": str(box.box), "rim_px": box.rim_px, "error": box.error},
+            "region": box
+            and {
+                "box": str(box.box),
+                "rim_px": box.rim_px,
+                "error": box.error,
+                "error_pct": box.error_pct,
+            },
             "flux_change_pct": self.flux_change_pct,
             "bright_change_pct": _change_pct(before[bright], after[bright]),
             "dark_change_pct": _change_pct(before[dark], after[dark]),
@@ -233,8 +239,10 @@ class PsfSource:
     - `load(header, progress)` reads it, or builds it for an image with this header.
     - `possible_psfs(psf, header)`: variants of the PSF within its errors, on the pixels of the image.
     - `key`: the same for the same PSF; None: the PSF belongs to the telescope in the header.
+    - `built`: what the instrument file says of a PSF that must be built, if it may be of another channel; such a PSF is
+      compared with the image before it is built.
     - `kernel_shape`: (ny, nx) of its kernel. `plate_scale_arcsec`: of a PSF that gives none.
-    - `prepared` keeps PSFs and engines between images. `other_channel`: see `input_warnings`.
+    - `prepared` keeps PSFs and engines between images. `other_channel`: see `check_channel`.
     - `seen_as` adds the instrument and the wavelength that the file does not name, for the checks.
     - `used`: how cards name it; None: as the PSF says. `provenance`: of a PSF whose file does not say it.
     - `warnings`: sentences about the PSF, by their codes.
@@ -243,6 +251,7 @@ class PsfSource:
     load: Callable[[Header, Progress | None], Psf]
     possible_psfs: Callable[[Psf, Header], Sequence[Psf]]
     key: Hashable = None
+    built: PsfOrigin | None = None
     kernel_shape: tuple[int, ...] = (REACH_GRID_PX, REACH_GRID_PX)
     plate_scale_arcsec: float | None = None
     prepared: PreparedPsfs = field(default_factory=PreparedPsfs)
@@ -293,7 +302,7 @@ def read_and_deconvolve(
         check_memory(plane, product_bytes(demand, shape[0] * shape[1]), free_bytes)
 
     def as_built() -> Psf:
-        if source.key is not None or shape is None:
+        if (source.key is not None and source.built is None) or shape is None:
             return with_scale(source.load(header, None), source.plate_scale_arcsec)
         with compiling_beside(options.method, shape):
             return with_scale(source.load(header, begin(BUILDING, 1)), source.plate_scale_arcsec)
@@ -306,12 +315,16 @@ def read_and_deconvolve(
         check_exposure_of_sun(header)
     of_telescope = known_instrument(header), frame_of(header).turn_to_build_deg
     key = (of_telescope if source.key is None else source.key, source.plate_scale_arcsec)
+    # A build takes a minute, so what the instrument file says is compared first.
+    origin = source.built or source.seen_as(prepared.as_built(key, as_built))
+    channel = check_channel(origin, header, other_channel=source.other_channel)
+    if source.built is not None:
+        binning_factor(with_scale(source.built, source.plate_scale_arcsec), header)
     whole = prepared.as_built(key, as_built)
-    check_channel(source.seen_as(whole), header, other_channel=source.other_channel)
     fitted = prepared.on_pixels_of(header, key, as_built)
     warnings = {
         **source.warnings,
-        **input_warnings(source.seen_as(fitted), image, options.method, other_channel=source.other_channel),
+        **input_warnings(source.seen_as(fitted), image, options.method, channel=channel),
     }
     for code, message in warnings.items():
         say(code, message)
@@ -426,8 +439,7 @@ def deconvolution_history(product: Product, psf: UsedPsf) -> list[str]:
             []
             if box is None
             else [
-                f"box {box.box} of the input alone, with a rim of {box.rim_px} px: differs from the same box of the "
-                f"whole image by at most {box.error:.3g} (estimated bound, in the unit of the image)"
+                f"box {box.box} of the input alone, with a rim of {box.rim_px} px: {region_error(box.error_pct)}"
             ]
         ),
         *([] if product.noise is None or product.noise.source == "given" else [f"noise: {product.noise}"]),

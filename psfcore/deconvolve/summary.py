@@ -17,12 +17,25 @@ def summary_lines(details: Mapping[str, Any]) -> list[str]:
     ]
     if region is not None:
         lines.append(
-            f"region {region['box']}, rim {region['rim_px']} px: differs from the same pixels of the whole image by "
-            f"at most {region['error']:.3g} (estimated bound, in the unit of the image)"
+            f"region {region['box']}, rim {region['rim_px']} px: {region_error(region.get('error_pct'))}"
         )
     if noise is not None:
         lines.append(f"errors from the noise: {noise['text']}")
     return lines
+
+
+def region_error(error_pct: float | None) -> str:
+    """How far the result of a region may differ from that of the whole image. error_pct: in percent of the region's
+    mean; None: a product of an earlier version, whose header gives it in the unit of the image alone.
+    """
+    if error_pct is None:
+        return "differs from the same pixels of the whole image by at most the card DCNVBERR"
+    if not error_pct:
+        return "does not differ from the same pixels of the whole image"
+    return (
+        f"differs from the same pixels of the whole image by at most {error_pct:.2g} % of the mean of the region "
+        "(estimated bound)"
+    )
 
 
 def steps_done(details: Mapping[str, Any]) -> str:

@@ -202,7 +202,7 @@ class BoxWork:
     rim. box, rim: the box, and the box with its rim, in the pixels of the whole image. shape: (ny, nx) of the whole
     image. edges: the assumption about the scene beyond the whole image. of_mask: QUALITY of the box that follows from
     the mask of box and rim. noise: noise of the camera, if known. error: Eq. (3), in the unit of the image; 0 if the
-    rim is the whole image.
+    rim is the whole image. mean: of the valid pixels of the box, in the unit of the image.
     """
 
     image: Image
@@ -214,6 +214,7 @@ class BoxWork:
     of_mask: NDArray[np.uint8]
     noise: Noise | None
     error: float
+    mean: float
 
     @property
     def rim_px(self) -> int:
@@ -233,7 +234,7 @@ class BoxWork:
             flux_out=flux_out,
             negative_pixels=negative_pixels,
             edges=self.edges,
-            of_box=OfBox(self.box, self.rim_px, self.error),
+            of_box=OfBox(self.box, self.rim_px, self.error, self.mean),
         )
 
     def assess(self, result: Deconvolved, errors: ErrorPlanes | None = None) -> Assessed:
@@ -296,7 +297,8 @@ def box_work(work: Work, box: Box) -> BoxWork:
     if margin_px is None:
         margin_px = margin_for(share_from_beyond(work.psf), shape, share=method.margin_share)
     far = _FarLight(work, margin_px, method.keeps_flux)
-    largest = options.region_error * abs(float(image.pixels[box.slices].mean(where=valid)))
+    mean = float(image.pixels[box.slices].mean(where=valid))
+    largest = options.region_error * abs(mean)
     for width_px in _widths(shape):
         rim = box.wider(width_px, shape, RIM_STEP_PX)
         if rim.shape == shape:
@@ -325,6 +327,7 @@ def box_work(work: Work, box: Box) -> BoxWork:
         of_mask=quality_plane(seen, seen.pixels, edge_px=0)[box.inside(rim).slices],
         noise=options.noise,
         error=error,
+        mean=mean,
     )
 
 

@@ -23,7 +23,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -167,20 +166,6 @@ def diffraction_patterns(
     return patterns
 
 
-class _Optics(TypedDict):
-    wavelength_angstrom: float
-    focal_length_mm: float
-    pixel_pitch_um: float
-    size: int
-
-
-class _Series(TypedDict):
-    pitch_um: float
-    wire_um: float
-    windows: int
-    size: int
-
-
 @dataclass
 class _OneWavelength:
     """All components at one wavelength, each computed from the aperture or from earlier components."""
@@ -223,18 +208,23 @@ class _OneWavelength:
         aperture = self.instrument.aperture
         if self.route.mask and not aperture.round:
             return self._far_field(AIRY, (), None, progress)
-        optics: _Optics = {
-            "wavelength_angstrom": self.wavelength_angstrom,
-            "focal_length_mm": self.instrument.focal_length_mm,
-            "pixel_pitch_um": self.instrument.detector.pixel_pitch_um,
-            "size": self.size,
-        }
+        wavelength_angstrom, focal_length_mm = self.wavelength_angstrom, self.instrument.focal_length_mm
+        pixel_pitch_um = self.instrument.detector.pixel_pitch_um
         if not aperture.round:
-            return edge_kernel(aperture, **optics)
+            return edge_kernel(
+                aperture,
+                wavelength_angstrom=wavelength_angstrom,
+                focal_length_mm=focal_length_mm,
+                pixel_pitch_um=pixel_pitch_um,
+                size=self.size,
+            )
         return airy_kernel(
             diameter_mm=aperture.diameter_mm,
             obscuration_diameter_mm=aperture.obscuration_diameter_mm,
-            **optics,
+            wavelength_angstrom=wavelength_angstrom,
+            focal_length_mm=focal_length_mm,
+            pixel_pitch_um=pixel_pitch_um,
+            size=self.size,
         )
 
     def _far_field(
@@ -286,17 +276,21 @@ class _OneWavelength:
             pitch_um=mesh.pitch_um,
             pixel_pitch_um=self.instrument.detector.pixel_pitch_um,
         )
-        series: _Series = {
-            "pitch_um": mesh.pitch_um,
-            "wire_um": mesh.wire_um,
-            "windows": windows_of(mesh),
-            "size": self.size,
-        }
+        windows = windows_of(mesh)
         if mesh.openings == "square" and mesh.angle_deg % 90 == 0:
-            line = mesh_line(spacing_px, **series)
+            line = mesh_line(
+                spacing_px, pitch_um=mesh.pitch_um, wire_um=mesh.wire_um, windows=windows, size=self.size
+            )
             return np.outer(line, line)
         kernel = rotated_mesh_kernel if mesh.openings == "square" else hexagonal_mesh_kernel
-        return kernel(spacing_px, angle_deg=mesh.angle_deg, **series)
+        return kernel(
+            spacing_px,
+            angle_deg=mesh.angle_deg,
+            pitch_um=mesh.pitch_um,
+            wire_um=mesh.wire_um,
+            windows=windows,
+            size=self.size,
+        )
 
     def _convolved(self, a: Kernel, b: Kernel) -> Kernel:
         return linear_convolve(a, b, (self.size, self.size), threads=self.threads)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 LARGEST_COUNT = 2**63 - 1
 LONGEST_TEXT = 68  # characters of a card's value
-LONGEST_KEY = 8  # characters of a keyword without HIERARCH
+_PLAIN_KEY = re.compile(r"[A-Z0-9_-]{0,8}")  # a keyword without HIERARCH
 LARGEST_NUMBER = 1e300
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d{1,3})?")
 
@@ -117,8 +117,10 @@ def plain_value(value: object) -> object:
 
 
 def long_key(key: str) -> str:
-    """A keyword as astropy takes it without a warning: keywords of more than 8 characters need HIERARCH."""
-    return key if len(key) <= LONGEST_KEY else f"HIERARCH {key}"
+    """A keyword as astropy takes it without a warning: keywords that are longer than 8 characters, or have others than
+    FITS allows, need HIERARCH.
+    """
+    return key if _PLAIN_KEY.fullmatch(key) else f"HIERARCH {key}"
 
 
 def number_of(value: object, *, text: bool = True) -> float | None:

@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import Protocol
+from dataclasses import dataclass
+from typing import Protocol, Self
 
 from psfcore.errors import DataError
 from psfcore.fits.cards import Cards, optional_text
@@ -24,7 +25,7 @@ from psfcore.instruments.files import (
     instrument_names,
     match_table,
 )
-from psfcore.instruments.model import load_instrument
+from psfcore.instruments.model import Instrument, load_instrument
 
 _TO_ALLOW = "set other_channel (--other-channel)"
 
@@ -51,6 +52,23 @@ class Origin(Protocol):
     @property
     def cards(self) -> Mapping[str, str]:
         """The cards of the images for which it is valid."""
+
+
+@dataclass(frozen=True)
+class PsfOrigin:
+    """The properties of a PSF that are known without its weights. cards: see `psfcore.psf.Psf`."""
+
+    name: str
+    instrument: str | None
+    wavelength_angstrom: float | None
+    plate_scale_arcsec: float | None
+    cards: Mapping[str, str]
+
+    @classmethod
+    def of_instrument(cls, instrument: Instrument) -> Self:
+        """The origin of the PSF that is built from an instrument file."""
+        scale = instrument.detector.plate_scale_arcsec
+        return cls(instrument.name, instrument.name, instrument.wavelength_angstrom, scale, {})
 
 
 def check_channel(psf: Origin, header: Cards, *, other_channel: bool = False) -> str | None:

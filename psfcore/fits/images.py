@@ -29,6 +29,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from enum import IntFlag
 from pathlib import Path
@@ -160,7 +161,7 @@ def write_image(
     header.update(_ascii(cards))
     for line in history:
         header.add_history(ascii_text(line))
-    hdus: list[Any] = [fits.PrimaryHDU(pixels, header)]
+    hdus: list[fits.PrimaryHDU | fits.ImageHDU] = [fits.PrimaryHDU(pixels, header)]
     for name, plane in (planes or {}).items():
         _check_plane(name, plane, pixels.shape, taken=[hdu.name for hdu in hdus])
         hdus.append(_plane_hdu(name, plane, header, image.unit, (plane_bits or {}).get(name)))
@@ -238,7 +239,7 @@ def _kept_header(source: fits.Header) -> fits.Header:
 
 def _as_text(card: fits.Card) -> str:
     try:
-        return "card kept as text: " + ascii_text(card.image.rstrip())
+        return "card kept as text: " + ascii_text(_image_of(card).rstrip())
     except (
         card_trouble()
     ):  # astropy repairs a damaged card before it shows it, and some cards cannot be repaired
@@ -251,21 +252,28 @@ def _readable(card: fits.Card) -> fits.Card:
     A value that FITS does not allow (NaN, "1 2 3") becomes a string.
     """
     value = _card_value(card)
-    copy = fits.Card(
+    written = fits.Card(
         long_key(card.keyword),
         ascii_text(value) if isinstance(value, str) else value,
         ascii_text(card.comment),
     )
-    copy.verify("silentfix")
-    fits.Card.fromstring(copy.image)
-    return copy
+    written.verify("silentfix")
+    fits.Card.fromstring(written.image)
+    return written
+
+
+def _image_of(card: fits.Card) -> str:
+    """The text of a card as FITS allows it. A repair is not worth a warning of astropy: NaN is common in cards."""
+    repaired = copy(card)
+    repaired.verify("silentfix+ignore")
+    return str(repaired.image)
 
 
 def _card_value(card: fits.Card) -> Any:
     try:
         value = card.value
     except VerifyError:
-        value = fits.Card.fromstring(card.image).value  # card.image contains the value as a quoted string
+        value = fits.Card.fromstring(_image_of(card)).value  # the text contains the value as a quoted string
     return str(value) if isinstance(value, (float, complex)) and not np.isfinite(value) else value
 
 

@@ -10,10 +10,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from astropy.io.fits import Header
+from astropy.io.fits import Header, ImageHDU
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError
@@ -27,10 +26,10 @@ from psfcore.fits.header import (
     known_instrument,
     optional_exposure_s,
 )
-from psfcore.fits.saturation import with_saturation
+from psfcore.fits.saturation import SETTING, with_saturation
 from psfcore.fits.units import check_linear, unit_of
 from psfcore.fits.unusable import ERRORS, FLAGS, unusable_pixels
-from psfcore.image import Image
+from psfcore.image import Image, MaskBit
 from psfcore.instruments.model import load_instrument
 
 LARGEST_PIXEL = 1e30  # products are single precision, and methods square the pixels
@@ -58,7 +57,11 @@ def read_observation(
 
 
 def observation_of_hdus(
-    hdus: Mapping[int, Any], number: int, *, chosen: int | None = None, saturation_dn: float | None = None
+    hdus: Mapping[int, ImageHDU],
+    number: int,
+    *,
+    chosen: int | None = None,
+    saturation_dn: float | None = None,
 ) -> Image:
     """The image of one HDU of astropy, with the planes in the HDUs after it. hdus: the HDUs with an image of two axes,
     by their numbers.
@@ -206,7 +209,13 @@ def _check_signal(image: Image, *, stored_as_integer: bool) -> None:
     if not whole:  # saturated pixels are finite, but say nothing about the signal
         smallest, largest = _range_of(image.pixels[valid])
     if smallest == largest <= 0 or abs(farthest) < 1 / LARGEST_PIXEL:
-        raise DataError("no-signal", f"expected light; the brightest pixel is {largest:g}: use another image")
+        saturated = int(np.count_nonzero(image.mask & MaskBit.SATURATED.value))
+        others = f", and {saturated} brighter pixels count as saturated" if saturated else ""
+        raise DataError(
+            "no-signal",
+            f"expected light; the brightest pixel {'below saturation ' if saturated else ''}is {largest:g}{others}: "
+            + (f"if they are not saturated, {SETTING}" if saturated else "use another image"),
+        )
     if smallest == largest and stored_as_integer and largest in _FULL_SCALES:
         raise DataError(
             "all-saturated",

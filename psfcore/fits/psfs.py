@@ -38,7 +38,9 @@ def write_psf(path: str | Path, psf: Psf, *, instrument_file: bytes | None = Non
     float32. The rounding changes each weight by at most 6e-8 of its value, and the sum by less than 1e-7.
     instrument_file: the TOML text from which the PSF was built. It is stored unchanged in INSTRUMENT.
     """
-    hdus: list[Any] = [fits.PrimaryHDU(psf.kernel.astype(np.float32), _psf_header(psf))]
+    hdus: list[fits.PrimaryHDU | fits.ImageHDU] = [
+        fits.PrimaryHDU(psf.kernel.astype(np.float32), _psf_header(psf))
+    ]
     for name, kernel in psf.components.items():
         component = fits.ImageHDU(kernel.astype(np.float32), name=ascii_text(name).upper())
         component.header["PSFSUM"] = (float(kernel.sum()), "sum of weights on this array")
@@ -247,7 +249,7 @@ def write_extras(target: BinaryIO, *, path: str, count: int, shape: list[int]) -
 
 
 def _fitted(
-    shape: str, parameters: list[str], coordinates: list[float], covariances: list[Any]
+    shape: str, parameters: list[str], coordinates: list[float], covariances: list[list[float]]
 ) -> FittedShape:
     rows = np.reshape(covariances, (len(parameters), -1)).tolist()  # of one parameter, a row is a number
     return FittedShape(shape, tuple(parameters), tuple(coordinates), tuple(map(tuple, rows)))
@@ -259,7 +261,7 @@ def _pixels(hdus: Sequence[Hdu]) -> int:
 
 
 @contextmanager
-def _first_hdus(path: str, count: int) -> Iterator[list[Any]]:
+def _first_hdus(path: str, count: int) -> Iterator[list[fits.PrimaryHDU | fits.ImageHDU]]:
     """The first HDUs of a file. count: as many as `all_hdus` finds.
 
     If a damaged size ends an HDU too early, astropy takes what follows for a header, and may read on without an end.

@@ -55,7 +55,7 @@ _BLOCK_ROWS = 256
 REQUEST, INSTRUMENT, PIXELS = "request", "instrument file", "pixels"
 _COUNTS = ("NSATPIX", "DATASAT")
 _LEVEL_CARDS = ("SATURATE", "DSATVAL", "SAT_THR")
-_SETTING = "set the level with saturation_dn (--saturation)"
+SETTING = "set the level with saturation_dn (--saturation)"
 
 
 def with_saturation(
@@ -82,7 +82,7 @@ def with_saturation(
             )
             told = (
                 f"{count} pixels have the value {top:g}, the largest{below}; they are masked as saturated: if they "
-                f"are not, {_SETTING}"
+                f"are not, {SETTING}"
                 if below or level.warning
                 else None
             )
@@ -91,7 +91,7 @@ def with_saturation(
             level = replace(
                 level,
                 warning=f"{count} pixels have the largest value, {top:g}; they may be saturated, but are not masked: "
-                f"if they are saturated, {_SETTING}",
+                f"if they are saturated, {SETTING}",
             )
     return replace(
         image, mask=mask, saturation=level if level.level is not None else replace(level, found=None)
@@ -123,7 +123,7 @@ def _level(image: Image, requested_dn: float | None, instrument_dn: float | None
             return Saturation(
                 None,
                 source,
-                f"the saturation level of {dn:g} DN cannot be compared with the image, because {why}: {_SETTING}",
+                f"the saturation level of {dn:g} DN cannot be compared with the image, because {why}: {SETTING}",
             )
     found = min(levels, key=lambda one: one.level or 0.0, default=Saturation(None, None, None))
     return (
@@ -145,7 +145,7 @@ def _rate_or_counts(image: Image, level: Saturation, scale: float | None) -> Sat
     return replace(
         level,
         warning=f"no pixel reaches the saturation level {level.found} = {level.level:g}, but {there} pixels do if it "
-        f"is in DN of one exposure: if it is, {_SETTING}",
+        f"is in DN of one exposure: if it is, {SETTING}",
     )
 
 
@@ -184,13 +184,13 @@ def _counted(image: Image, level: Saturation) -> Saturation:
             f"{above} pixels are above the saturation level {level.level:g}, but {card} counts {counted} saturated "
             "pixels: the values were changed after they were counted; "
             f"{f'about {counted} of the brightest are' if counted else 'none of them is'} masked: if this is wrong, "
-            f"{_SETTING}",
+            f"{SETTING}",
         )
     if level.found == "NSATPIX" and counted and not np.any(image.pixels >= level.level):
         return replace(
             level,
             warning=f"NSATPIX counts {counted} saturated pixels, but no pixel is at {AIA_LEVEL_DN:g} DN or above: the "
-            f"image was cut or its values were changed; saturated pixels that are left are not masked: {_SETTING}",
+            f"image was cut or its values were changed; saturated pixels that are left are not masked: {SETTING}",
         )
     return level
 

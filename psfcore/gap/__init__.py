@@ -14,7 +14,7 @@ one:
         plane = np.exp(-(((x - 0.5) / 0.15) ** 2)).astype(np.float32)
         return [Change(lambda n, images: plane, unocculted=False)]
 
-    EFFECTS = (Effect("edge_glow", "detector", (EffectParameter("height", "DN/s", 5.0),),
+    EFFECTS = (Effect("lamp_glow", "detector", (EffectParameter("height", "DN/s", 5.0),),
         "A lamp beside the detector lights its right edge.", "a dark exposure", ("detector_x",), glow),)
 
 `heliopsf gap TRANSIT --local --effects FILE.py` tests your effects together with the library. A service also tests the

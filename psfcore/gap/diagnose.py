@@ -53,6 +53,8 @@ from psfcore.scatter.reconstruction import Progress, Solution, labelled
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Shape, shape_named
 from psfcore.transit.transit import Fold, Transit
 
+MOST_EXAMPLES = 3  # of images that were not used, in a caution
+
 
 @dataclass(frozen=True, eq=False)
 class Shrinking:
@@ -115,6 +117,14 @@ class Diagnosis:
         return tuple(e for e in self.evidence.effects if e.name in self.answer.named)
 
 
+STAGES = (
+    "fit",
+    "model of the gap",
+    "hypotheses",
+    "full refit",
+)  # the last one only if `refit`, and a cause is told
+
+
 def diagnose(
     transit: Transit,
     *,
@@ -146,10 +156,13 @@ def diagnose(
     noise = measured_noise(transit)
     if noise is not None and not noise.agrees:
         transit = replace(transit, noise=noise.noise)
-    solution = solution_of(transit, shape, solution, start=start, threads=threads, progress=progress)
+    of_fit, of_model, of_hypotheses, of_refit = (
+        labelled(progress, f"{stage} ({n} of {4 if refit else 3})") for n, stage in enumerate(STAGES, start=1)
+    )
+    solution = solution_of(transit, shape, solution, start=start, threads=threads, progress=of_fit)
     view = View(solution)
-    model, expected = linear_model_of(view, library, seed=seed, progress=progress)
-    progress("hypotheses", 0, 1)
+    model, expected = linear_model_of(view, library, seed=seed, progress=of_model)
+    of_hypotheses("comparing", 0, 1)
     return_unused_memory()  # of the simulated transit and its fit
     answer = answer_of(model, level)
     rng = np.random.default_rng(seed)
@@ -166,7 +179,7 @@ def diagnose(
         and answer.verdict in ("attributed", "tie")
         and set(told.names) <= set(effects)
     ):
-        corrected = _refit(view, model, [effects[name] for name in told.names], told, failures, progress)
+        corrected = _refit(view, model, [effects[name] for name in told.names], told, failures, of_refit)
     schemes = (time_blocks(model), pointings(model))
     held_out = [hold_out(model, (), scheme) for scheme in schemes]
     closing = partial(_shrinking, held_out, schemes, rng, bool(answer.causes))
@@ -269,7 +282,7 @@ def _refit(
     """The full refit with these effects; None, and a sentence in `failures`, if it fails."""
     label = label_of(fit.names)
     try:
-        told = labelled(progress, f"full refit with {label}")
+        told = labelled(progress, label)
         return add_to_model(view.solution, effects, fit, model, view=view, progress=told)
     except DataError as error:  # the fit may fail if the subtracted effect is not in the images
         failures.append(f"The full refit with {label} in the model failed: {error}")
@@ -366,8 +379,10 @@ def cautions_of(solution: Solution, noise: MeasuredNoise | None, evidence: Evide
     unmatched = [info.file for info in infos if not info.described]
     some = f"{', '.join(unmatched[:3])}{', …' if len(unmatched) > 3 else ''}"
     aimed = len({info.pointing for info in evidence.image_info})
+    unused = f"{len(left_out)} image{'s were' if len(left_out) > 1 else ' was'} not used"
+    examples = ". Examples: " if len(left_out) > MOST_EXAMPLES else ": "
     rows = (
-        (left_out, f"{len(left_out)} images were not used. Examples: {'; '.join(left_out[:3])}"),
+        (left_out, f"{unused}{examples}{'; '.join(left_out[:MOST_EXAMPLES])}"),
         (
             unmatched,
             f"In {len(unmatched)} images ({some}) the scene around the occulter differs from the scene in the "

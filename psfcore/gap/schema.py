@@ -35,22 +35,15 @@ class AlternativeJson(TypedDict):
     words: str
 
 
-class MapJson(TypedDict):
-    """A map of the detector: value and sigma by row (y_px) and column (x_px)."""
-
-    x_px: list[float]
-    y_px: list[float]
-    value: list[list[float]]
-    sigma: list[list[float]]
-
-
 class FieldJson(TypedDict):
-    """The field of a family. It has a map, or a curve: first the abscissa by its name, then value and sigma."""
+    """The field of a family. It has a map: x_px, y_px, and value and sigma in rows of y; or a curve: first
+    the abscissa by its name, then value and sigma.
+    """
 
     words: str
     unit: str
     strength: NumberJson
-    map: NotRequired[MapJson]
+    map: NotRequired[dict[str, list[float] | list[list[float]]]]
     curve: NotRequired[dict[str, list[float]]]
 
 
@@ -90,13 +83,6 @@ class AxisJson(TypedDict):
     of_best: bool
 
 
-class UntestableJson(TypedDict):
-    """An effect that the data cannot show, and why."""
-
-    name: str
-    why: str
-
-
 class ParameterLimitsJson(TypedDict):
     """The limits of one parameter. Only data exclude a strength."""
 
@@ -117,7 +103,7 @@ class LimitsJson(TypedDict):
 
     limits: dict[str, EffectLimitsJson]
     alike: list[dict[str, object]]
-    untestable: list[UntestableJson]
+    untestable: list[dict[str, str]]
 
 
 class PointingJson(TypedDict):
@@ -159,12 +145,14 @@ class GapReport(TypedDict):
     sentence: str
     gap: dict[str, object]
     where: list[AxisJson]
+    unocculted: dict[str, object]
     verdict: str
     answer: list[str]
     level: float
     causes: list[CauseJson]
     closure: IntervalJson | None
     would_separate: str
+    would_confirm: str
     hypotheses: list[HypothesisJson]
     probabilities: dict[str, float]
     limits: dict[str, EffectLimitsJson]
@@ -172,7 +160,7 @@ class GapReport(TypedDict):
     calibration: dict[str, object]
     effects: list[FitJson]
     together: list[FitJson]
-    untestable: list[UntestableJson]
+    untestable: list[dict[str, str]]
     cautions: list[str]
     expected: dict[str, float]
     psf: PsfJson

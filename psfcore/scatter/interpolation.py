@@ -33,7 +33,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
-from typing import Any
 
 import numpy as np
 
@@ -230,10 +229,16 @@ def _check_same_telescope(before: Psf, after: Psf) -> None:
         )
 
 
-def _same(one: Any, other: Any, tolerance: float | None) -> bool:
-    if tolerance is None or not one or not other:
-        return bool(one == other)
-    return bool(abs(one / other - 1) <= tolerance)
+def _same(one: object, other: object, tolerance: float | None) -> bool:
+    if (
+        tolerance is not None
+        and isinstance(one, int | float)
+        and isinstance(other, int | float)
+        and one
+        and other
+    ):
+        return abs(one / other - 1) <= tolerance
+    return one == other
 
 
 def _check_same_diffraction(before: Psf, after: Psf) -> None:

@@ -142,18 +142,18 @@ class Local(Operations):
 
     def wait(self, job: dict[str, Any], *, progress: Progress | None = None) -> dict[str, Any]:
         """Compute the result of a request. The progress of a job that counts several times is the percent of its
-        estimated time.
+        estimated time, and after this time the steps of its stage.
         """
         request, started_s = self._jobs.pop(job["id"]), time.monotonic()
         expected_s = self._expected_s(job["kind"], request)
 
         def report(stage: str, step: int, steps: int) -> None:
             with self.times.step(stage, step):
-                if progress is not None and expected_s is None:
+                share = None if expected_s is None else (time.monotonic() - started_s) / expected_s
+                if progress is not None and share is not None and share < 1:
+                    progress(stage, int(100 * share), 100)
+                elif progress is not None:
                     progress(stage, step, max(steps, 1))
-                elif progress is not None and expected_s is not None:
-                    share = (time.monotonic() - started_s) / expected_s
-                    progress(stage, min(round(100 * share), 99), 100)
 
         def compiling(done: bool) -> None:
             with self.times.step(COMPILING, int(done)):

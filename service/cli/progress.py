@@ -80,7 +80,7 @@ def step_text(stage: str, step: int, steps: int) -> str:
     A task reports an unknown number of steps as 1. A job of several counts reports percents of its estimated time.
     """
     if steps == 100:
-        return f"{stage}: {step} %"
+        return f"{stage}: {step} % of the estimated time"
     if (steps <= 1 and step < steps) or not steps:
         return stage
     return f"{stage}: {STEPS_OF.get(stage, 'step')} {step} of {steps}"
@@ -102,7 +102,7 @@ class _Teller:
         now_s = time.monotonic()
         with self.lock:
             left_s = self.pace.left_s(step, steps, now_s)
-            # A job that takes longer than estimated has no time left, but goes on.
+            # A job may take longer than its pace, which then says nothing of the time left.
             left = "" if left_s is None or left_s < 1 else f", {duration(left_s)} left"
             if self.bar:
                 filled = round(20 * step / max(steps, 1))

@@ -8,6 +8,7 @@ A command imports numerical libraries only when it is called, so that other comm
 from __future__ import annotations
 
 import json
+import shlex
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -155,7 +156,7 @@ def gap() -> None:
     "corrected_file",
     type=OUTPUT,
     help="Write the corrected PSF (FITS): the PSF fitted with the named effects in the model; for a tie, with the "
-    "best one",
+    "most probable one",
 )
 @click.option(
     "--effects",
@@ -206,25 +207,28 @@ def diagnose(
     files = [output, json_file, plot, corrected_file if corrected else None]
     if any(files):
         echo(f"written: {', '.join(str(path) for path in files if path is not None)}")
-    step = _next_step(report, f"{transit}{' --local' if is_local() else ''}", output, corrected_file)
+    step = _next_step(
+        report, f"{shlex.quote(str(transit))}{' --local' if is_local() else ''}", output, corrected_file
+    )
     if step:
         echo(f"next: {step}")
     if corrected_file is not None and corrected is None:
         raise click.ClickException(
-            f"{corrected_file} was not written: the diagnosis found no effect for a corrected PSF (verdict "
+            f"{corrected_file} was not written: the diagnosis gave no corrected PSF (verdict "
             f"{report['verdict']})"
         )
 
 
 def _next_step(report: dict[str, Any], transit: str, page: Path | None, corrected: Path | None) -> str:
     """What to do with this verdict, in one line; empty if there is nothing to do."""
-    if report["psf"]["with_answer"] is not None and corrected is None:
-        return f"`heliopsf gap {transit} --corrected PSF.fits` writes the PSF without the effect"
     if report["verdict"] in ("inconclusive", "tie"):
         return "`heliopsf gap plan PLAN` tells whether images that are not taken yet would decide"
+    if report["psf"]["with_answer"] is not None and corrected is None:
+        named = " and ".join(name.replace("_", " ") for name in report["answer"])
+        return f"`heliopsf gap {transit} --corrected PSF.fits` writes the PSF that was fitted with {named} in the model"
     if any(cause["field"] for cause in report["causes"]):
         where = "-o PAGE.html writes a page with" if page is None else f"{page} has"
-        return f"{where} the map or the curve of the change"
+        return f"{where} the map or the curve of the change; --effects FILE.py tests a form of yours (docs/gap.md)"
     return ""
 
 

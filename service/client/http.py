@@ -304,7 +304,7 @@ class Client(Connection, Operations):
                     if share is None:
                         progress(now["stage"], now["step"], max(now["steps"], 1))
                     else:
-                        progress(now["stage"], round(100 * share), 100)
+                        progress(now["stage"], int(100 * share), 100)
         except KeyboardInterrupt as stop:
             raise WaitInterrupted("job", job["id"], self.server) from stop
         return self._ended(job)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from psfcore.errors import DataError
-from psfcore.fits.channel import binning_factor, check_channel
+from psfcore.fits.channel import PsfOrigin, binning_factor, check_channel
 from psfcore.fits.frame import plate_scale_arcsec
 from psfcore.fits.header import origin_of, wavelength_angstrom
 from psfcore.instruments.model import load_instrument
@@ -26,17 +26,6 @@ from workers.versions import INTERPOLATED, PsfStatus, without_variant
 
 DEPRECATED_CODE = "psf-deprecated"  # the code of the error and of the warning
 SHOWN_DIGITS = 12
-
-
-@dataclass(frozen=True)
-class PsfOrigin:
-    """The properties of a PSF that are known without its file. cards: see `psfcore.psf.Psf`."""
-
-    name: str
-    instrument: str | None
-    wavelength_angstrom: float | None
-    plate_scale_arcsec: float | None
-    cards: Mapping[str, str]
 
 
 def check(request: ResolvedDeconvolve, psf: PsfRow | None, header: Mapping[str, Any]) -> None:
@@ -56,7 +45,7 @@ def suits(psf: PsfRow | str, header: Mapping[str, Any]) -> bool:
     """Whether the channel and the pixels of an image fit a PSF. psf: its row, or the name of its instrument. header: as
     in ``check``.
     """
-    origin = _origin_of(psf) if isinstance(psf, str) else _origin_of_row(psf)
+    origin = PsfOrigin.of_instrument(load_instrument(psf)) if isinstance(psf, str) else _origin_of_row(psf)
     try:
         check_channel(origin, header["cards"])
         binning_factor(origin, header["cards"])
@@ -79,7 +68,11 @@ def _origin(request: ResolvedDeconvolve, psf: PsfRow | None) -> PsfOrigin | None
     """The known properties of the PSF of a request; None if the user's own instrument file says them."""
     if psf is None:
         recipe = request.psf_recipe
-        return None if recipe is None or recipe.instrument is None else _origin_of(recipe.instrument)
+        return (
+            None
+            if recipe is None or recipe.instrument is None
+            else PsfOrigin.of_instrument(load_instrument(recipe.instrument))
+        )
     return _origin_of_row(psf)
 
 
@@ -96,11 +89,6 @@ def _origin_of_row(psf: PsfRow) -> PsfOrigin:
     named, cards = origin_of(kept)
     instrument, angstrom = of_upload(psf, named, wavelength_angstrom(kept))
     return PsfOrigin(psf.name, instrument, angstrom, plate_scale_arcsec(kept), cards)
-
-
-def _origin_of(name: str) -> PsfOrigin:
-    known = load_instrument(name)
-    return PsfOrigin(known.name, known.name, known.wavelength_angstrom, known.detector.plate_scale_arcsec, {})
 
 
 @dataclass(frozen=True)

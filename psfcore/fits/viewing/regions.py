@@ -161,6 +161,6 @@ def moved_header(whole: fits.Header, columns: slice, rows: slice) -> fits.Header
     return header
 
 
-def _cut(hdu: Any, columns: slice, rows: slice) -> Any:
+def _cut(hdu: fits.ImageHDU, columns: slice, rows: slice) -> Any:
     make = fits.PrimaryHDU if isinstance(hdu, fits.PrimaryHDU) else fits.ImageHDU
     return make(np.asarray(hdu.section[rows, columns]), moved_header(hdu.header, columns, rows))

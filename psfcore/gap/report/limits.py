@@ -9,7 +9,7 @@ import sys
 from psfcore.drawing.page import render
 from psfcore.gap.evidence.linear_model import UNLIKELY
 from psfcore.gap.planning import Planned
-from psfcore.gap.report.report import words
+from psfcore.gap.report.report import unit_words, words
 from psfcore.gap.verdict.limits import ALIKE, Limits, ParameterLimits
 
 Row = list[str]
@@ -29,7 +29,7 @@ def limit_rows(limits: Limits) -> list[Row]:
             words(one.name),
             strength,
             "" if one.excluded_95 is None else f"{one.excluded_95:.3g}",
-            one.unit,
+            unit_words(one.unit),
         ]
         for name, one, strength in _strengths(limits)
     ]
@@ -88,7 +88,7 @@ def sentence(found: Planned) -> str:
     alike = f"{pairs} pair{'s' if pairs > 1 else ''} of effects could not be told apart"
     return (
         f"The images of this plan would show {visible} of {len(limits.effects)} effects at their likely size; "
-        f"{alike if pairs else 'all of them could be told apart'}."
+        f"{alike if pairs else 'no pair of the effects that would be found looks alike'}."
     )
 
 
@@ -106,7 +106,8 @@ def lines(found: Planned) -> list[str]:
         out.append(f"{_marked(name, name, found):<28}{at:<34}{likely:<14}{_remark(one)}".rstrip())
     out += ["", f"could not be told apart (distance below {ALIKE:g} sigma):"]
     out += [
-        f"  {one.distance:.2f}  {' and '.join(one.pair)}: take {one.would_separate}" for one in limits.alike
+        f"  {one.distance:.2f}  {' and '.join(one.pair)}{one.would_separate and f': take {one.would_separate}'}"
+        for one in limits.alike
     ]
     out += [] if limits.alike else ["  none"]
     out += [f"not testable: {name} ({why})" for name, why in limits.untestable.items()]
@@ -121,7 +122,7 @@ def strength_rows(found: Planned) -> list[Row]:
             _marked(name, words(name), found),
             words(one.name),
             strength,
-            one.unit,
+            unit_words(one.unit),
             f"{one.likely:.3g}",
             _remark(one),
             found.settled_by[name],

@@ -6,7 +6,6 @@ are those that the verdict names as the cause of the gap ("answer" in the report
 
 from __future__ import annotations
 
-import re
 import sys
 
 from psfcore.drawing.numbers import DASH, with_error
@@ -22,20 +21,22 @@ from psfcore.gap.report.report import (
     label_words,
     p_words,
     percent_words,
+    unit_words,
     words,
 )
 from psfcore.gap.schema import GapReport, IntervalJson
-from psfcore.gap.verdict.axes import SIGN_FLIPS
+from psfcore.gap.verdict.answer import UNKNOWN
+from psfcore.gap.verdict.axes import SIGN_FLIPS, SIGNIFICANT
 from psfcore.gap.verdict.correction import ROUNDS
 
 Row = list[str]
 
 VERDICTS = {
     "none": "no gap is detected: nothing is much more probable than noise and the error of the fit",
-    "attributed": "there is a gap, and each of its causes is sure",
+    "attributed": "there is a gap, and each of its causes has one alternative",
     "tie": "there is a gap, and these data cannot separate several effects that can cause it",
-    "unknown": "there is a gap, and its cause has a form that the library does not have",
-    "inconclusive": "the alternatives are of different kinds: effects of the library, and other forms",
+    "unknown": "there is a gap, and its most probable cause has a form that the library does not have",
+    "inconclusive": "too few images, or alternatives of different kinds: effects of the library, and other forms",
 }
 MOST_HYPOTHESES = 8
 
@@ -74,9 +75,36 @@ def interval_words(interval: IntervalJson) -> str:
     return f"{value:.1f} ({low:.1f} to {high:.1f})"
 
 
-def unit_words(unit: str) -> str:
-    """A unit as text for the page, for example "px²"."""
-    return re.sub(r"(?<=[a-z])2\b", "²", unit)
+def names_of_answer(report: GapReport) -> tuple[str, str, str]:
+    """What the named effects are (sure, tied, or the most probable ones), their names, and what each of them does."""
+    kind = {"tie": "tied effects", "inconclusive": "most probable effects"}.get(
+        report["verdict"], "named effects"
+    )
+    named = [one for one in report["answer"] if one != UNKNOWN]
+    causes = {one["name"]: one["cause"] for one in report["effects"]}
+    does = [
+        f"{words(name)}: {causes[name]}" if len(named) > 1 else causes[name]
+        for name in named
+        if name in causes
+    ]
+    return (
+        kind if report["answer"] else "named effects",
+        ", ".join(map(words, report["answer"])) or "none",
+        " ".join(does),
+    )
+
+
+def order_of_axes(report: GapReport) -> str:
+    """Why the first axis comes first, if another one has a larger share; else empty."""
+    first, *others = report["where"]
+    if not any(one["share"] > first["share"] for one in others):
+        return ""
+    why = (
+        "the told cause varies along it"
+        if first["of_best"]
+        else f"axes with a p-value of at most {SIGNIFICANT:g} come before the others"
+    )
+    return f"The first axis does not have the largest share: it is first because {why}."
 
 
 def cause_rows(report: GapReport) -> list[Row]:

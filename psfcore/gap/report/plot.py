@@ -162,6 +162,28 @@ def draw_map(figure: Figure | SubFigure, report: GapReport) -> None:
     tidy(charts)
 
 
+def unocculted_png(report: GapReport) -> bytes:
+    """The residual of the unocculted field of each image against time, without and with the named effects."""
+    return _png(WIDTH_IN, 3.4, lambda figure: draw_unocculted(figure.subplots(), report))
+
+
+def draw_unocculted(axes: Axes, report: GapReport) -> None:
+    """Draw the residual of the blocks of each image, in units of the noise. Full symbols: the fitted model. Open
+    symbols: the model with the named effects.
+    """
+    rows = report["images"]
+    minutes = _column(rows, "time_s") / 60
+    axes.axhline(1.0, color="#555555", linewidth=1.0)
+    for fov, (here, colour, symbol) in _looks(rows).items():
+        before, after = (_column(rows, name)[here] for name in ("unocculted", "unocculted_after"))
+        axes.plot(minutes[here], before, symbol, color=colour, ms=5, mew=0, label=f"pointing {fov}")
+        axes.plot(minutes[here], after, symbol, color=colour, ms=4.5, mfc="white", mew=1.2)
+    axes.set(xlabel="Time from the first image (min)", ylabel="Residual (noise)")
+    axes.set_ylim(bottom=0.0)
+    axes.legend(fontsize=8.5, loc="best", framealpha=0.85, edgecolor="none")
+    tidy([axes])
+
+
 def field_png(report: GapReport) -> bytes:
     """The first cause that has a shape: a map of the detector with its errors, or a curve."""
     field = field_of(report)

@@ -350,8 +350,10 @@ def causes_of(shares: Mapping[Labels, float], level: float) -> tuple[Cause, ...]
         group = smallest_group(rest, level)
         if not group:
             break
+        # The group is in the order in which it was found, and later members may be more probable than earlier ones.
+        told = [group[0], *sorted(group[1:], key=lambda label: -whole[label])]
         found.append(
-            Cause(tuple(Alternative(FAMILIES[one[0]], one[1], min(whole[one], 1.0)) for one in group))
+            Cause(tuple(Alternative(FAMILIES[one[0]], one[1], min(whole[one], 1.0)) for one in told))
         )
         rest = sums(
             (labels - {next((x for x in group if x in labels), None)}, share)

@@ -39,8 +39,8 @@ class Axis:
     """How much of the gap varies along one axis, and where the gap is largest.
 
     share: fraction, 0 to 1. alone: the decrease of chi2 by this axis alone. at: the pointings with the largest
-    residuals, and the range of the axis in them. of_best: the axis comes first because the best effect varies along it,
-    although another axis has a larger share.
+    residuals, and the range of the axis in them. of_best: the axis comes first because the best effect varies along it;
+    by p-value and share another one would.
     """
 
     name: str

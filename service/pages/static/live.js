@@ -130,7 +130,7 @@ function progress(job) {
   if (job.phase !== "EXECUTING") return "";
   const { stage, step, steps, time_left_s: left } = job.progress;
   const pace = left === null ? "" : `, ${duration(left)} left`;
-  return steps > 0 ? `${stage} ${step} of ${steps}${pace}` : stage;
+  return steps > 1 ? `${stage}, step ${step} of ${steps}${pace}` : `${stage}${pace}`;
 }
 
 function placeInQueue(before) {

@@ -118,9 +118,9 @@ def test_the_light_that_is_cut_off_is_told_and_the_result_is_that_of_the_cut_psf
     image = Image(pixels, np.zeros(pixels.shape, np.uint8), fits.Header(), "DN", None)
     needed = crop_centred(large.kernel, (2 * IMAGE_PX - 1,) * 2)
     cut = replace(large, kernel=needed)
-    warned = input_warnings(large, image, "richardson-lucy", other_channel=True)
+    warned = input_warnings(large, image, "richardson-lucy", channel=None)
     assert f"needs 127 x 127 px: {100 * (1 - needed.sum()):.3g} % of its light" in warned["psf-cut"]
-    assert "psf-cut" not in input_warnings(cut, image, "richardson-lucy", other_channel=True)
+    assert "psf-cut" not in input_warnings(cut, image, "richardson-lucy", channel=None)
     options = Options(parameters=STEPS, margin_px=16)
     whole, same = (deconvolve(image, psf, options, warnings={}) for psf in (large, cut))
     np.testing.assert_allclose(whole.pixels, same.pixels, rtol=1e-6)

@@ -75,6 +75,7 @@ def test_a_box_alone_differs_from_the_whole_image_by_at_most_its_bound(
         result, expected = alone.run(), whole[box.slices]
         assert result.pixels.shape == box.shape and result.of_box is not None
         assert 0 < result.of_box.error <= 0.1 * image.pixels[box.slices].mean()
+        assert result.of_box.error_pct == 100 * result.of_box.error / image.pixels[box.slices].mean()
         assert alone.rim.shape != alone.shape, "a part of the image alone was deconvolved"
         assert np.abs(result.pixels - expected).max() <= result.of_box.error
         # Without light from beyond the rim, the box would be wrong: the bound is not met by any result.

@@ -12,7 +12,7 @@ from psfcore.errors import DataError
 from psfcore.gap.library.registry import LIBRARY
 from psfcore.gap.planning import Planned, planned_limits
 from psfcore.gap.report.limits import NOT_FOUND, lines, plan_page
-from psfcore.gap.verdict.limits import ALIKE, EffectLimits, ParameterLimits
+from psfcore.gap.verdict.limits import ALIKE, Alike, EffectLimits, ParameterLimits
 from psfcore.simulate.plan import HIGH, Plan, default_plan
 from tests.html_page import check_stands_alone, read_page
 from tests.transit_files import diffraction
@@ -98,3 +98,8 @@ def test_text_and_page_name_every_effect_and_pair() -> None:
     text, html = "\n".join(lines(plan)), plan_page(plan)
     assert f"offset: {NOT_FOUND}" in text and "share 0.2" in text and "would show 0 of 2 effects" in text
     assert "could not be tested" not in html and "not usable" not in text
+    assert "no pair of the effects that would be found looks alike" in text
+    # No sentence is made from an observation that is not known.
+    pair = Alike(("dark_offset", "wide_halo"), 1.4, "")
+    text = "\n".join(lines(replace(plan, limits=replace(limits, alike=(pair,)))))
+    assert "  1.40  dark_offset and wide_halo\n" in text + "\n" and "take" not in text

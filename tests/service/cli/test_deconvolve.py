@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -15,6 +16,8 @@ import pytest
 from astropy.io import fits
 from click.testing import CliRunner, Result
 
+import heliopsf
+from psfcore.errors import DataError
 from service.cli.main import main
 from service.client.http import Client
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
@@ -65,6 +68,31 @@ def test_one_image_goes_into_a_file(folder: Path) -> None:
     done = run("deconvolve", folder / "in" / "0.fits", "-o", folder / "level.fits", *level, *options(folder))
     assert done.exit_code == 0, done.output
     assert fits.getheader(folder / "level.fits")["DCNVSATL"] == 50.0  # 100 DN in 2 s
+
+
+def test_a_region_tells_its_error_in_percent_of_its_mean(folder: Path) -> None:
+    asked = ("deconvolve", folder / "in" / "0.fits", "-o", folder / "new.fits", "--region", "8:40,8:40")
+    done = run(*asked, "--region-error", 0.9, *options(folder))
+    assert done.exit_code == 0, done.output
+    (line,) = (line for line in done.stdout.splitlines() if line.startswith("region "))
+    found = re.search(r"at most ([\d.]+) % of the mean of the region", line)
+    assert found is not None and 0 < float(found[1]) <= 90, line
+
+
+def test_a_psf_of_another_channel_is_refused_before_it_is_built(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HELIOPSF_CACHE_DIR", str(folder / "cache"))
+    write_image(folder / "aia.fits", TELESCOP="SDO/AIA", WAVELNTH=171, CDELT1=0.6, CDELT2=0.6)
+    asked = ("deconvolve", folder / "aia.fits", "-o", folder / "new.fits", "--local")
+    for scale, code in (((), "171 angstrom"), (("--plate-scale", 0.7), "171 angstrom")):
+        done = run(*asked, "--psf", "aia_193", *scale)
+        assert done.exit_code == 1 and code in done.output, done.output
+    done = run(*asked, "--psf", "aia_171", "--plate-scale", 0.7)
+    assert done.exit_code == 1 and "leave the plate scale out" in done.output
+    with pytest.raises(DataError, match="channel-mismatch"):
+        heliopsf.deconvolve(folder / "aia.fits", "aia_193")
+    assert not (folder / "cache").exists(), "a PSF was built"
 
 
 def test_the_time_of_each_stage_is_printed(folder: Path) -> None:

@@ -66,6 +66,7 @@ def test_with_nothing_there_it_says_so_and_makes_nothing(tmp_path: Path) -> None
     answer = ask()
     assert answer.exit_code == 0, answer.output
     said = " ".join(answer.output.split())
+    assert "\x1b" not in said and "x1b" not in said, "the health check logs it"
     assert "does not exist yet -> `heliopsf serve` makes it" in said
     assert list(tmp_path.iterdir()) == []
 

@@ -17,10 +17,13 @@ from psfcore.fits.header import seen_by
 from psfcore.instruments.unknown import unknown_instrument
 from service.cli import options as cli_options
 from service.cli import progress
+from service.cli.local import Local
 from service.cli.main import NO_KEY, main, user_errors
 from service.cli.progress import Pace, progress_bar, say
 from service.client.http import ServiceError
 from tests.conftest import write_image, write_psf
+from workers.contract.kinds import Kind
+from workers.tasks.workspace import Workspace
 
 
 @pytest.fixture
@@ -171,11 +174,26 @@ def test_without_a_terminal_a_line_is_written_now_and_then(
     ]
 
 
-def test_a_job_that_takes_longer_than_estimated_has_no_time_left(
-    clock: list[float], capsys: pytest.CaptureFixture[str]
+def test_a_job_that_takes_longer_than_estimated_tells_its_steps(
+    clock: list[float], capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with progress_bar() as report:
-        for second in range(40):
-            report("fitting", min(10 * second, 99), 100)
+    """A job whose estimate is 20 s."""
+
+    def task(workspace: Workspace, _: object) -> str:
+        for second in range(45):
+            workspace.report("fit (1 of 4): errors", second, 60)
             clock[0] += 1
-    assert capsys.readouterr().err.splitlines() == [f"fitting: 99 % after {s} s" for s in (10, 20, 30)]
+        return "0"
+
+    monkeypatch.setattr(Kind, "load_task", lambda _: task)
+    monkeypatch.setattr(Local, "_expected_s", lambda *_: 20.0)
+    with progress_bar() as report:
+        service = Local(tmp_path)
+        job = service.submit("psf-build", instrument="hri_euv")
+        service.wait(job, progress=report)
+    assert capsys.readouterr().err.splitlines() == [
+        "fit (1 of 4): errors: 50 % of the estimated time after 10 s, 10 s left",
+        "fit (1 of 4): errors: step 20 of 60 after 20 s",
+        "fit (1 of 4): errors: step 30 of 60 after 30 s, 30 s left",
+        "fit (1 of 4): errors: step 40 of 60 after 40 s, 20 s left",
+    ]

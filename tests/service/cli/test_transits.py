@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+import re
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,7 @@ from tests.html_page import check_stands_alone, read_page
 from tests.service.conftest import result_of, upload
 from tests.transit_files import TRUTH, diffraction, write_simulated
 from workers.tasks import gap as gap_task
+from workers.tasks.workspace import Progress
 
 
 @pytest.fixture(scope="module")
@@ -124,16 +126,21 @@ class Diagnosed:
     done: Result
     out: Path
     found: Diagnosis
+    stages: Sequence[str]
 
 
 @pytest.fixture(scope="module")
 def diagnosed(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Diagnosed:
     """Nothing is patched but the library's length; the light that the file describes is in the images."""
-    out, made = tmp_path_factory.mktemp("diagnosed"), []
+    out, made, stages = tmp_path_factory.mktemp("diagnosed"), [], list[str]()
     (out / "mine.py").write_text(EDGE_GLOW)
 
-    def kept(*given: Any, **how: Any) -> Diagnosis:
-        made.append(diagnose(*given, **how))
+    def kept(*given: Any, progress: Progress, **how: Any) -> Diagnosis:
+        def told(stage: str, step: int, steps: int) -> None:
+            stages.append(stage)
+            progress(stage, step, steps)
+
+        made.append(diagnose(*given, progress=told, **how))
         return made[0]
 
     with quick_diagnosis(), patch.object(gap_task, "diagnose", kept):
@@ -142,7 +149,13 @@ def diagnosed(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Diagnos
             "--plot", out / "g.png", "--corrected", out / "psf.fits",
         )  # fmt: skip
     assert done.exit_code == 0, done.output
-    return Diagnosed(done, out, made[0])
+    return Diagnosed(done, out, made[0], stages)
+
+
+def test_the_stages_are_numbered_in_their_order(diagnosed: Diagnosed) -> None:
+    numbers = [found[0] for stage in diagnosed.stages if (found := re.findall(r"\((\d) of 4\): ", stage))]
+    assert len(numbers) == len(diagnosed.stages) and numbers == sorted(numbers)
+    assert set(numbers) == {"1", "2", "3", "4"}
 
 
 def test_an_effect_of_one_s_own_is_found_with_its_size(diagnosed: Diagnosed) -> None:
@@ -192,7 +205,7 @@ def test_a_corrected_psf_that_there_is_not_is_said_after_all_else(
     assert [how["coverage"] for how in asked] == [0.8]
     assert done.exit_code == 1 and not psf.exists()
     assert done.output.splitlines()[3] == "verdict: none"
-    assert "was not written: the diagnosis found no effect for a corrected PSF (verdict none)" in done.output
+    assert "was not written: the diagnosis gave no corrected PSF (verdict none)" in done.output
     assert json.loads(numbers.read_text())["verdict"] == "none"
 
 
@@ -200,7 +213,14 @@ def test_the_next_step_is_a_command_that_works_here(
     folder: Path, diagnosed: Diagnosed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tied = replace(diagnosed.found, corrected=None, answer=replace(diagnosed.found.answer, verdict="tie"))
-    for found, step in ((diagnosed.found, f"gap {folder} --local --corrected "), (tied, "gap plan ")):
+    # A PSF corrected for the most probable of several effects is no next step.
+    both = replace(tied, corrected=diagnosed.found.corrected)
+    steps = (
+        (diagnosed.found, f"gap {folder} --local --corrected "),
+        (tied, "gap plan "),
+        (both, "gap plan "),
+    )
+    for found, step in steps:
         answer_at_once(monkeypatch, found)
         said = run(folder, "--local").output.splitlines()
         assert said[-1].startswith(f"next: `heliopsf {step}")

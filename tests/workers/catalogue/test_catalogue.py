@@ -192,9 +192,11 @@ def test_a_job_that_counts_several_times_is_told_by_its_estimated_time() -> None
     row = JobRow(
         kind="gap-diagnose", phase="EXECUTING", started_at=1000.0, estimate={"seconds": 60.0}, step=3, steps=9
     )
-    for now, share, left_s in ((1015.0, 0.25, 45.0), (1045.0, 0.75, 15.0), (1100.0, 0.99, None)):
-        assert (share_of_time(row, now), time_left_s(row, now)) == (pytest.approx(share), left_s)
-    row.estimate = None
+    for now, share, left_s in ((1015.0, 0.25, 45.0), (1045.0, 0.75, 15.0), (1060.0, None, None)):
+        assert (share_of_time(row, now), time_left_s(row, now)) == (share, left_s)
+    row.steps = 0
+    assert share_of_time(row, 1015.0) is None, "compiling"
+    row.steps, row.estimate = 9, None
     assert share_of_time(row, 1015.0) is None and time_left_s(row, 1015.0) is None
     counted = JobRow(kind="psf-fit", phase="EXECUTING", started_at=1000.0, estimate={"seconds": 60.0})
     assert share_of_time(counted, 1015.0) is None

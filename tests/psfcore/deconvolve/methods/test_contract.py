@@ -15,20 +15,6 @@ STEPS = 3
 LEAST_GAIN = 0.95  # a few steps must bring the estimate nearer to the scene by 5 %
 
 
-def faults(name: str) -> list[str]:
-    """A sentence for each thing that a method lacks."""
-    told = []
-    figures = ("margin_of_psf", "plane_bytes", "transform_bytes")
-    if any(getattr(properties_of(name), figure) is None for figure in figures):
-        told.append(f"{name}: measure {', '.join(figures)}: python -m benchmarks.growth memory")
-    if not _approaches(name):
-        told.append(
-            f"{name}: {STEPS} steps do not bring the estimate nearer to the scene: divide a filter in the layout of "
-            "engine.transfer by engine.transfer_scale (psfcore/deconvolve/iterations/linear.py)"
-        )
-    return told
-
-
 def _approaches(name: str) -> bool:
     scene, psf = solar_scene((96, 96), 4), make_psf(gaussian(33, 1.2))
     image = make_image(observe(scene, psf, exposure_s=1.0, photon_gain_dn=0.0, read_noise_dn=0.0, seed=1))
@@ -39,5 +25,14 @@ def _approaches(name: str) -> bool:
 
 
 @pytest.mark.parametrize("name", method_names())
-def test_a_method_has_all_that_it_needs(name: str) -> None:
-    assert faults(name) == []
+def test_a_method_has_all_that_it_needs(name: str, subtests: pytest.Subtests) -> None:
+    """Each thing has a subtest, so that the failure of one does not hide another."""
+    with subtests.test("memory"):
+        figures = ("margin_of_psf", "plane_bytes", "transform_bytes")
+        missing = [figure for figure in figures if getattr(properties_of(name), figure) is None]
+        assert not missing, "measure them: python -m benchmarks.growth memory"
+    with subtests.test("steps"):
+        assert _approaches(name), (
+            f"{STEPS} steps do not bring the estimate nearer to the scene: divide a filter in the layout of "
+            "engine.transfer by engine.transfer_scale (psfcore/deconvolve/iterations/linear.py)"
+        )

@@ -59,8 +59,8 @@ def test_modules_changed_files_and_the_examples_of_the_documentation(
     indented = "\n".join(line[4:] for line in gap.__doc__.splitlines() if line.startswith("    "))
     codes = re.findall(r"```python\n(.*?)```", DOCUMENTATION.read_text("utf-8"), re.S)
     (in_page,) = (code for code in codes if "EFFECTS" in code)
-    for example in (text, indented, in_page):
-        assert one_of(source_in(tmp_path, example)).name == "edge_glow"
+    for example, name in ((text, "edge_glow"), (indented, "lamp_glow"), (in_page, "lamp_glow")):
+        assert one_of(source_in(tmp_path, example)).name == name
     module = "my_effects_module"
     source_in(tmp_path, name=f"{module}.py")
     monkeypatch.syspath_prepend(tmp_path)

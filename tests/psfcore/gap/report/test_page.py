@@ -16,9 +16,17 @@ from psfcore.drawing.numbers import with_error
 from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.evidence.tree import FAMILIES
 from psfcore.gap.report import plot as gap_plot
-from psfcore.gap.report.page import gap_page, interval_words, unit_words
-from psfcore.gap.report.plot import cell_means, draw_effects, draw_map, field_png, gap_png, simulated_of
-from psfcore.gap.report.report import gap_report, label_words, percent_words
+from psfcore.gap.report.page import gap_page, interval_words, order_of_axes
+from psfcore.gap.report.plot import (
+    cell_means,
+    draw_effects,
+    draw_map,
+    draw_unocculted,
+    field_png,
+    gap_png,
+    simulated_of,
+)
+from psfcore.gap.report.report import gap_report, label_words, percent_words, promise_words, unit_words
 from psfcore.gap.verdict.limits import Alike
 from tests.blank_figures import blank_figures
 from tests.html_page import check_stands_alone, read_page
@@ -150,16 +158,20 @@ def test_every_kind_of_answer_is_explained_on_its_page(kind: str, blank: None) -
         assert [told, percent_words(share)] in rows
     assert HOLDS_FOR in text and "19 simulated transits" in text
     assert said["probability of no cause"] == percent_words(given.shares.get((), 0.0))
-    name = "most probable effects" if given.verdict == "inconclusive" else "named effects"
-    assert said[name] == (", ".join(given.named).replace("_", " ") or "none")
+    # The promise stands with what was measured with the effects of another author.
+    assert promise_words(report["calibration"]) in text
+    names = {"inconclusive": "most probable effects", "tie": "tied effects"}
+    assert said[names.get(given.verdict, "named effects")] == (
+        ", ".join(given.named).replace("_", " ") or "none"
+    )
 
 
 def test_what_has_no_picture_is_told_in_words(blank: None) -> None:
-    assert "No two effects are closer than 3 sigma" in text_of(html())
+    assert "No two effects that would be found are closer than 3 sigma" in text_of(html())
     pair = Alike(("dark_offset", "core_blur"), 1.4, "a series of exposure times")
     page = page_of(replace(found(), limits=replace(found().limits, alike=(pair,))))
     assert ["dark offset and core blur", "1.40", "a series of exposure times"] in rows_of(page)
-    assert "No two effects are closer" not in text_of(page)
+    assert "No two effects that" not in text_of(page)
     few = replace(judged("none"), residual=None)
     page = page_of(few)
     check_stands_alone(page)
@@ -167,6 +179,35 @@ def test_what_has_no_picture_is_told_in_words(blank: None) -> None:
     assert len(pictures(page)) == 2
     for diagnosis in (few, found(), judged("map"), judged("curve")):
         assert gap_png(diagnosis, report_of(diagnosis)).startswith(b"\x89PNG")
+
+
+def test_a_gap_of_the_unocculted_field_has_its_own_figure_and_numbers(blank: None) -> None:
+    report = report_of(found())
+    assert {"unocculted", "unocculted_after"} <= set(report["images"][0])
+    assert not any("unocculted" in name for name in pictures(gap_page(found(), report).html))
+    report["unocculted"] = {"residual": 4.02, "residual_after": 1.1, "noise_pct": 0.2, "shows_the_gap": True}
+    page = gap_page(found(), report).html
+    check_stands_alone(page)
+    assert pictures(page)[0] == "Residuals of the unocculted field of every image against time"
+    said = values(page)
+    assert said["unocculted field"] == "4.0 times the noise"
+    assert said["unocculted field with the told causes"] == "1.1 times the noise"
+    assert "gap with the told causes in the model" not in said and "both maps show noise" in text_of(page)
+    for image in report["images"]:
+        image |= {"unocculted": 5.0, "unocculted_after": 1.0}
+    axes = Figure().subplots()
+    draw_unocculted(axes, report)
+    drawn = [line.get_ydata() for line in axes.lines[1:]]
+    assert {float(value) for line in drawn[::2] for value in line} == {5.0}
+    assert {float(value) for line in drawn[1::2] for value in line} == {1.0}
+
+
+def test_the_order_of_the_axes_is_explained_if_the_first_is_not_the_largest() -> None:
+    axes = [{"share": 0.2, "of_best": False}, {"share": 0.3, "of_best": False}]
+    assert "p-value of at most 0.05 come before" in order_of_axes({"where": axes})
+    axes[0]["of_best"] = True
+    assert "the told cause varies along it" in order_of_axes({"where": axes})
+    assert order_of_axes({"where": axes[::-1]}) == order_of_axes({"where": axes[:1]}) == ""
 
 
 def test_a_malicious_file_name_is_shown_as_text(blank: None) -> None:

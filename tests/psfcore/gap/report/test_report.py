@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,12 +17,19 @@ from psfcore.gap.report.report import (
     AXIS_WORDS,
     CLEAR,
     LEAST_SHARE,
+    axes_words,
+    change_words,
     clearest_words,
+    closing_words,
     gap_report,
     in_short_if_many,
     p_words,
     percent_words,
+    pointing_shares,
+    promise_words,
 )
+from psfcore.gap.verdict.calibration import ANOTHER_AUTHOR
+from psfcore.gap.verdict.closure import Interval
 from psfcore.gap.verdict.limits import Alike
 from tests.psfcore.gap.report.judged import ABOUT, GIVEN, LEVEL, OFFSET, Given, judged, with_shares
 from tests.psfcore.gap.small_gaps import found
@@ -34,12 +42,12 @@ FIELDS |= dict.fromkeys(
 )
 # Words that the lines of an answer contain: of WHICH, and of HOW FAR.
 SAID = {
-    "none": (["no cause", "70 %", "dark offset (15 %)"], ["dark offset above", "DN"]),
-    "name": (["dark offset (offset 6.", "DN; 95 %"], ["dark offset closes", "falls from"]),
-    "two": (["dark offset (offset 6.", "beside it core blur (variance"], []),
+    "none": (["no cause", "70 %", "dark offset (15 %)"], ["dark offset (offset above", "DN"]),
+    "name": (["dark offset (offset = 6.", "DN; 95 %", "confirm it, take a dark"], ["dark offset closes", "falls from"]),
+    "two": (["dark offset (offset = 6.", "beside it core blur (variance", "To confirm them"], []),
     "beside": (["dark offset", f"; beside it {FAMILIES['light_place'].words}, in a form"], ["with another form of"]),
     "sun": (["scene evolution (96 %)"], ["Sun"]),
-    "with_sun": (["dark offset (offset 6.", "; beside it scene evolution (95 %)"], ["dark offset closes"]),
+    "with_sun": (["dark offset (offset = 6.", "; beside it scene evolution (95 %)"], ["dark offset closes"]),
     "tie": (["52 %) or gain mismatch (48 %)", "take a dark exposure", "both gain modes"], ["gain mismatch closes"]),
     "map": ([f"{FAMILIES['light_place'].words}, in a form that the library does not have (95 %)"], ["another form of"]),
     "curve": ([f"{FAMILIES['psf_time'].words}, in a form"], ["another form of"]),
@@ -156,7 +164,7 @@ def test_limits_alike_and_calibration_are_stated() -> None:
     offset, limit = report["effects"][0]["parameters"]["offset"], report["limits"]["dark_offset"]
     assert limit["found_90"] < offset["value"] < limit["excluded_95"]
     assert report["alike"] == [vars(pair) | {"pair": list(pair.pair)}]
-    assert report["calibration"] == {"cases": 19, "covered": 1.0} | ABOUT
+    assert report["calibration"] == {"cases": 19, "covered": 1.0, "another_author": ANOTHER_AUTHOR} | ABOUT
     given = Given({(OFFSET,): 1 - LEAST_SHARE / 2, (): LEAST_SHARE / 2}, "attributed", ("dark_offset",))
     report = report_of(with_shares(given))
     assert [one["causes"] for one in report["hypotheses"]] == [[{"family": OFFSET[0], "effect": OFFSET[1]}]]
@@ -169,7 +177,7 @@ def test_the_axes_of_the_first_line_are_significant_and_in_order() -> None:
         "time": (0.2, 0.001),
         "detector_x": (0.3, 0.01),
         "exposure": (0.4, 0.5),
-        "pointing": (0.05, 0.001),
+        "pointing": (0.04, 0.001),
     }
     axes = [
         replace(axis, share=shares[axis.name][0], p_value=shares[axis.name][1])
@@ -177,7 +185,23 @@ def test_the_axes_of_the_first_line_are_significant_and_in_order() -> None:
         if axis.name in shares
     ]
     line = report_of(replace(named, where=tuple(axes)))["lines"][0]
-    assert "it varies along detector x (30 %), in time (20 %), and is largest in pointing" in line
+    assert "it varies most clearly along detector x (30 %) and in time (20 %), although" in line
+    assert "although the share with the exposure time is 40 %, which is not significant (p = 0.5)" in line
+    axes = [replace(axis, share=0.25) if axis.name == "exposure" else axis for axis in axes]
+    assert axes_words(axes) == "; it varies along detector x (30 %) and in time (20 %)"
+    assert axes_words([replace(axis, p_value=0.5) for axis in axes]) == ""
+
+
+def test_the_pointings_of_the_first_line_hold_most_of_the_gap() -> None:
+    named, shares = judged("name"), pointing_shares(judged("name"))
+    assert sum(shares.values()) == pytest.approx(1.0) and min(shares.values()) >= 0
+    line = report_of(named)["lines"][0]
+    (percent, last) = re.findall(
+        r"; (?:> )?(\d+) % of the chi2 of the gap is in pointings? ([\d and]+)\.", line
+    )[0]
+    told = [int(one) for one in last.split(" and ")]
+    assert set(told) == set(list(shares)[: len(told)]) and len(told) < len(shares)
+    assert int(percent) == round(100 * sum(shares[one] for one in told)) >= 60
 
 
 def test_few_images_and_a_gap_of_the_unocculted_field() -> None:
@@ -197,6 +221,80 @@ def test_few_images_and_a_gap_of_the_unocculted_field() -> None:
     alone = replace(judged("curve"), model=replace(model, evidence=evidence), rms=small)
     lines = report_of(alone)["lines"]
     assert "in the unocculted field" in lines[0] and "discs" not in lines[2]
+    # The lines have the size of the gap there, without and with the told cause, and what the discs show.
+    held_out = alone.residual
+    assert held_out is not None
+    one = np.ones_like(held_out.unocculted_chi2)
+    before, after = (
+        replace(held_out, unocculted_chi2=size**2 * 7 * one, unocculted_expected=7 * one)
+        for size in (4.9, 1.1)
+    )
+    alone = replace(alone, residual=before, residual_after=after)
+    said = report_of(alone)
+    size, lines = said["unocculted"], said["lines"]
+    assert (size["residual"], size["residual_after"]) == pytest.approx((4.9, 1.1)) and size["shows_the_gap"]
+    assert f"by 4.9 times their noise of {size['noise_pct']:.2g} %; the discs show none, 0.1 %" in lines[0]
+    assert "the difference in the unocculted field falls from 4.9 to 1.1 times the noise" in lines[2]
+    assert [image["unocculted"] for image in said["images"]] == pytest.approx([4.9] * len(said["images"]))
+    # Without images that can be held out, no part of the sentence is empty.
+    assert "unocculted field; the discs" in report_of(replace(alone, residual=None))["lines"][0]
+
+
+def test_no_sentence_is_made_from_an_observation_that_is_not_known() -> None:
+    for kind, ends in (("tie", "; no observation is known that would."), ("name", "95 %).")):
+        told = judged(kind)
+        effects = tuple(replace(effect, settled_by="") for effect in told.evidence.effects)
+        model = replace(told.model, evidence=replace(told.evidence, effects=effects))
+        report = report_of(replace(told, model=model))
+        assert report["lines"][1].endswith(ends), report["lines"][1]
+        assert "take" not in report["lines"][1] and not report["would_separate"] + report["would_confirm"]
+    # A cause without a name in the library has a next step too.
+    door = FAMILIES["light_place"].settled_by
+    assert report_of(judged("map"))["lines"][1].endswith(f"To confirm it, take {door}.")
+    assert report_of(judged("beside"))["would_confirm"].endswith(f"; and {door}")
+
+
+def test_a_place_is_told_with_its_error_and_with_how_far_it_is_known() -> None:
+    found = judged("map")
+    (shape,) = found.shapes.values()
+    clear = replace(shape, sigma=np.full_like(shape.sigma, np.abs(shape.values).max() / 10))
+    line = report_of(replace(found, shapes=dict.fromkeys(found.shapes, clear)))["lines"][0]
+    assert re.search(
+        r"clearest with -?[\d.]+ ± [\d.]+ DN/s at x = \d+ px, y = \d+ px \(known only near the discs\)", line
+    )
+
+
+def test_closure_and_change_are_told_as_their_intervals_allow() -> None:
+    closing = {
+        Interval(0.8, 0.47, 1.0): "it closes 80 % (47 to 100) of the gap",
+        Interval(0.4, -0.2, 0.7): "it closes 40 % (less than 0 to 70) of the gap",
+        Interval(-1.4, -5.5, 1.0): "these data cannot say whether it closes none or all of the gap",
+        Interval(0.3, -0.1, 0.998): "these data cannot say whether it closes none or all of the gap",
+        Interval(-0.4, -2.0, 0.02): "it closes none of the gap (at most 2 %)",
+        Interval(-0.4, -2.0, -0.1): "it closes none of the gap (at most 0 %)",
+    }
+    assert {closure: closing_words("it", closure) for closure in closing} == closing
+    before = Interval(3.0, 1.8, 3.8)
+    changes = {
+        Interval(1.0, 0.2, 1.9): "falls from 3.0 % (1.8 to 3.8) to 1.0 % (0.2 to 1.9)",
+        Interval(
+            1.3, 0.0, 3.8
+        ): "changes from 3.0 % (1.8 to 3.8) to 1.3 % (0.0 to 3.8), which is within the errors",
+        Interval(5.0, 4.0, 6.0): "rises from 3.0 % (1.8 to 3.8) to 5.0 % (4.0 to 6.0)",
+    }
+    assert {after: change_words(before, after) for after in changes} == changes
+
+
+def test_the_measured_coverage_is_that_of_the_documentation() -> None:
+    results = Path("docs/gap.md").read_text("utf-8")
+    row = next(
+        one for one in results.splitlines() if one.startswith("| 10 % left: an entry covers the cause")
+    )
+    causes, covered, interval = (cell.strip() for cell in row.split("|")[2:5])
+    assert (int(causes), float(covered)) == (ANOTHER_AUTHOR["causes"], ANOTHER_AUTHOR["covered"])
+    assert [float(end) for end in interval.split(" - ")] == ANOTHER_AUTHOR["ci95"]
+    promise = promise_words(report_of(judged("name"))["calibration"])
+    assert f"{100 * ANOTHER_AUTHOR['covered']:.0f} % (46 to 85) of 19 causes" in promise
 
 
 def test_words_for_probabilities_and_parameters() -> None:

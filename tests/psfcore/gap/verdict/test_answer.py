@@ -91,6 +91,19 @@ def few_discs(evidence: Evidence, count: int) -> Evidence:
     return replace(evidence, discs=evidence.discs[:count])
 
 
+def test_alternatives_are_told_the_most_probable_first() -> None:
+    """The group finds MESH before BLUR, which is more probable, but mostly beside DARK."""
+    shares = {(DARK,): 0.3, (DARK, BLUR): 0.31, (MESH,): 0.25, (BLUR,): 0.14}
+    assert smallest_group({frozenset(labels): share for labels, share in shares.items()}, 0.92) == [
+        DARK,
+        MESH,
+        BLUR,
+    ]
+    causes = causes_of({frozenset(labels): share for labels, share in shares.items()}, 0.92)
+    assert [one.effect for one in causes[0].alternatives] == ["dark_offset", "core_blur", "mesh_pitch"]
+    assert [one.probability for one in causes[0].alternatives] == pytest.approx([0.61, 0.45, 0.25])
+
+
 def test_levels_and_verdicts(evidence: Evidence, monkeypatch: pytest.MonkeyPatch) -> None:
     levels = [
         ("name", (DARK,)),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from psfcore.errors import DataError
-from psfcore.gap.verdict.calibration import COVERAGE, MOST, Calibration, shipped_calibration
+from psfcore.gap.verdict.calibration import ANOTHER_AUTHOR, COVERAGE, MOST, Calibration, shipped_calibration
 
 
 def test_the_level_is_a_quantile_of_the_cases() -> None:
@@ -34,7 +34,15 @@ def test_further_cases_are_covered_as_stated() -> None:
 
 def test_the_calibration_says_how_it_was_made() -> None:
     about = {"seed": 3, "holds_for": "transits like these"}
-    assert Calibration((0.2, 0.4), about).to_json(0.3) == {"cases": 2, "covered": 0.5} | about
+    assert (
+        Calibration((0.2, 0.4), about).to_json(0.3)
+        == {
+            "cases": 2,
+            "covered": 0.5,
+            "another_author": ANOTHER_AUTHOR,
+        }
+        | about
+    )
     shipped = shipped_calibration()
     assert shipped.about["command"].startswith("python -m studies.gap_calibration ")
     assert f"--seed {shipped.about['seed']} " in shipped.about["command"]
