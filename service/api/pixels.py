@@ -14,11 +14,11 @@ from typing import Annotated, Any, BinaryIO, Literal
 from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import JSONResponse, StreamingResponse
-from pydantic import BaseModel, Field
 
 from psfcore.errors import DataError
 from psfcore.fits.header import all_cards
 from psfcore.fits.viewing.planes import Decoded, Plane, decode_plane
+from service.client.answers import HduHeader
 from service.http import files
 from service.http.callers import Reading
 from service.http.problems import RESPONSES, Problem, as_problems
@@ -201,17 +201,6 @@ def _cut(plane: Plane, part: Part, bits: bool) -> tuple[tuple[int, int], int, It
 
     window = window_of(plane.shape, x=part.x, y=part.y, width=part.width, height=part.height, step=part.step)
     return window.shape, window.length, pixels(plane, window, bits=bits)
-
-
-class HduHeader(BaseModel):
-    """The header of one HDU of a FITS file."""
-
-    index: int = Field(description="number of the HDU, counted from 0")
-    name: str = Field(description="EXTNAME; empty: the HDU has no name")
-    cards: list[tuple[str, str | int | float | bool | None, str]] = Field(
-        description="keyword, value and comment of each card, in the order of the file; value null: the card has no "
-        "value"
-    )
 
 
 @headers.get(

@@ -13,10 +13,16 @@ from typing import Annotated, Any, BinaryIO, cast
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import JSONResponse
-from pydantic import BaseModel, Field
 
 from psfcore.fits.stored_psf import write_cutout
 from psfcore.tables import lookup as psf_lookup
+from service.client.answers import (
+    AnnulusAnswer,
+    ComparisonAnswer,
+    CurveAnswer,
+    EncircledAnswer,
+    ProfileAnswer,
+)
 from service.http import files
 from service.http.callers import Caller, Reading
 from service.http.cutouts import cutout_of
@@ -31,78 +37,6 @@ ANSWERS_VERSION = 2
 router = APIRouter(prefix="/v1/psfs", tags=["PSFs"], responses=RESPONSES)
 
 Radius = Annotated[float, Query(description="distance from the PSF's centre, px")]
-ByComponent = dict[str, list[float]]
-
-
-class PsfSaid(BaseModel):
-    """The fields that every answer has: the PSF, and properties of its array."""
-
-    name: str
-    version: str
-    shape: list[int]
-    sum_on_array: float
-    central_weight: float
-    reach_px: float
-    plate_scale_arcsec: float | None
-
-
-class CurveAnswer(PsfSaid):
-    """1 - encircled energy at the given radii, in percent, for the total PSF (TOTAL) and each component."""
-
-    radii_px: list[float]
-    light_beyond_pct: ByComponent
-    sigma_points: ByComponent = Field(description="1-sigma errors; only for a fitted PSF")
-    resolution: str = Field(description="resolution of the table, and the largest error of the interpolation")
-
-
-class ProfileAnswer(PsfSaid):
-    """Mean weight of the pixels of each ring."""
-
-    radius_px: list[float]
-    pixels: list[int]
-    mean_weight: ByComponent
-    sigma: ByComponent = Field(description="1-sigma errors; only for a fitted PSF")
-    azimuthal_rms_over_mean: list[float] = Field(
-        description="rms variation of TOTAL along a ring, divided by its mean on the ring"
-    )
-    resolution: str
-
-
-class EncircledAnswer(PsfSaid):
-    """Encircled energy: the fraction of the light within a radius."""
-
-    radius_px: float
-    light_within: dict[str, float]
-    sigma: dict[str, float]
-    resolution: str
-
-
-class AnnulusAnswer(PsfSaid):
-    """The fraction of the light between two radii."""
-
-    inner_px: float
-    outer_px: float
-    light: dict[str, float]
-    sigma: dict[str, float]
-    resolution: str
-
-
-class ComparisonAnswer(BaseModel):
-    """Differences between two PSFs: `other` minus `one`."""
-
-    one: PsfSaid
-    other: PsfSaid
-    radii_px: list[float]
-    difference_points: ByComponent = Field(
-        description="difference of the light beyond each radius, in percentage points"
-    )
-    sigma_points: ByComponent
-    largest_points: dict[str, float]
-    difference_of_sums: float
-    difference_of_central_weights: float
-    only_in_one: list[str]
-    only_in_other: list[str]
-    resolution: str
 
 
 @in_turn(

@@ -16,7 +16,6 @@ from psfcore.deconvolve.summary import percent
 from service.cli.connection import (
     CONTEXT,
     ID,
-    Row,
     id_argument,
     named_psf,
     on_service,
@@ -34,18 +33,20 @@ from workers.contract.requests import Treatment
 from workers.versions import PsfStatus
 
 if TYPE_CHECKING:
+    from service.client.answers import Bulk, BulkEstimate, BulkLine, BulkResult
     from service.client.http import Client
 
 _CONDITION = re.compile(r"([A-Z0-9_-]{1,8})\s*(=|!=|<=|>=|<|>)\s*(.+)")
 # HTTP statuses with which the service refuses one file. After any other refusal, the next file would be refused too.
 OF_ONE_FILE, OF_ALL_FILES = (400, 413, 415, 422), ("quota-exceeded",)
+Value = bool | int | float | str
 BULK_ID = id_argument("bulk_id")
 WAIT = click.option(
     "--wait", is_flag=True, help="Wait until the bulk run ends; the exit status is 1 if an image failed"
 )
 
 
-def _condition(text: str) -> tuple[str, str, Any]:
+def _condition(text: str) -> tuple[str, str, Value]:
     """Keyword, comparison sign and value of a text such as WAVELNTH=174."""
     parts = _CONDITION.fullmatch(text.strip())
     if parts is None:
@@ -91,7 +92,7 @@ def submit(
     psf: str | None,
     uploads: tuple[Path, ...],
     images: tuple[str, ...],
-    conditions: tuple[tuple[str, str, Any], ...],
+    conditions: tuple[tuple[str, str, Value], ...],
     dry_run: bool,
     wait: bool,
     **parameters: Any,
@@ -148,7 +149,7 @@ def submit(
 def list_bulks(service: Client, most: int) -> None:
     """List your bulk runs, newest first."""
 
-    def line(row: Row) -> str:
+    def line(row: BulkLine) -> str:
         return (
             f"{short(row['id'])}  {row['phase']:<9}  {moment(row['created_at'])}  {row['done']} of "
             f"{_total(row, row['total'])} done, {row['failed']} failed  {row['name']}"
@@ -218,8 +219,8 @@ def report(
     for row in service.bulk_results(bulk_id, order="worst", limit=most) if most else ():
         echo(_line(row))
     failed = list(service.bulk_failures(bulk_id))
-    for row in failed[:most]:
-        echo(f"failed: {row['source']}: {row['error']['message']}")
+    for one in failed[:most]:
+        echo(f"failed: {one['source']}: {one['error']['message']}")
     if len(failed) > most:
         echo(f"... and {len(failed) - most} more {'failure' if len(failed) == most + 1 else 'failures'}")
     if output is not None:
@@ -249,20 +250,20 @@ def _upload(service: Client, files: Sequence[Path]) -> tuple[list[str], int]:
     return uploaded, len(files) - len(uploaded)
 
 
-def _wait(service: Client, bulk_id: str) -> Row:
+def _wait(service: Client, bulk_id: str) -> Bulk:
     """Wait until a run ends; returns its description."""
     with progress_bar() as report:
         return service.wait_for_bulk(bulk_id, progress=report)
 
 
-def _end(run: Row, wait: bool) -> None:
+def _end(run: Bulk, wait: bool) -> None:
     """Print the state of a run. wait: exit with status 1 if the run is not completed or if an image failed."""
     _print_run(run)
     if wait and (run["phase"] != "COMPLETED" or run["images"]["failed"]):
         sys.exit(1)
 
 
-def _print_estimate(estimate: Row) -> None:
+def _print_estimate(estimate: BulkEstimate) -> None:
     """Print the result of a dry run."""
     workers, more = estimate["workers"], estimate["refused_images"] - len(estimate["refused"])
     lines = [
@@ -285,7 +286,7 @@ def _print_estimate(estimate: Row) -> None:
     echo("\n".join(lines))
 
 
-def _print_run(run: Row) -> None:
+def _print_run(run: Bulk) -> None:
     """Print the state of a run."""
     images = run["images"]
     existed = f" ({images['reused']} existed already)" if images["reused"] else ""
@@ -302,26 +303,26 @@ def _print_run(run: Row) -> None:
         echo(f"stopped: {run['error']['message']}")
 
 
-def _total(run: Row, total: int) -> str:
+def _total(run: Bulk | BulkLine, total: int) -> str:
     """The number of images of a run, as far as it is known."""
     return str(total) if run["listed"] else f"at least {total}"
 
 
-def _line(row: dict[str, Any]) -> str:
+def _line(row: BulkResult) -> str:
     changes = "  ".join(
-        f"{kind} {percent(row[kind]['sum_pct'])} (to {row[kind]['up_to_pct']:+.0f})"
-        for kind in ("bright", "dark")
-        if row[kind] is not None
+        f"{kind} {percent(change['sum_pct'])} (to {change['up_to_pct']:+.0f})"
+        for kind, change in (("bright", row["bright"]), ("dark", row["dark"]))
+        if change is not None
     )
     warnings = f"  (warnings: {', '.join(row['warnings'])})" if row["warnings"] else ""
     return f"{row['score']:8.2f}  {changes}  {row['source']}{warnings}"
 
 
-def _where(conditions: Sequence[tuple[str, str, Any]]) -> dict[str, Any]:
+def _where(conditions: Sequence[tuple[str, str, Value]]) -> dict[str, object]:
     """The conditions in the form that the request needs. If a keyword has several values, one of these values is
     enough.
     """
-    where: dict[str, Any] = {}
+    where: dict[str, object] = {}
     for key, sign, value in conditions:
         before = where.get(key)
         if before is not None and isinstance(before, dict) == (sign == "="):
@@ -329,7 +330,7 @@ def _where(conditions: Sequence[tuple[str, str, Any]]) -> dict[str, Any]:
                 f"--where {key}: use either values (=) or comparisons for one keyword, not both"
             )
         if sign != "=":
-            where[key] = (before or {}) | {sign: value}
+            where[key] = {**(before if isinstance(before, dict) else {}), sign: value}
         elif before is None:
             where[key] = value
         else:
@@ -337,7 +338,7 @@ def _where(conditions: Sequence[tuple[str, str, Any]]) -> dict[str, Any]:
     return where
 
 
-def _value(text: str) -> bool | int | float | str:
+def _value(text: str) -> Value:
     """The value of a text: T or F is a logical value, a number is a number, anything else is a text. Quotation marks
     make any value a text.
     """

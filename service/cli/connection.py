@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import click
 from click.shell_completion import CompletionItem
@@ -24,6 +24,7 @@ from workers.contract.requests import FEWEST_DIGITS, Deconvolve
 from workers.machine import published_folder
 
 if TYPE_CHECKING:
+    from service.client.answers import Uploaded
     from service.client.http import Client
 
 _KEY = "heliopsf.key"
@@ -32,7 +33,6 @@ DIGITS = 64  # number of digits of a whole id, except ids of jobs and bulk runs
 _ID = re.compile(rf"[0-9a-f]{{{FEWEST_DIGITS},{DIGITS}}}")
 _DIGITS = f"{FEWEST_DIGITS} or more hexadecimal digits"
 Thing = TypeVar("Thing")
-Row = dict[str, Any]
 
 
 class _Id(click.ParamType):
@@ -210,8 +210,9 @@ def named_psf(service: Operations, psf: str | None) -> str | None:
         return service.psf_of_instrument(psf)
     if psf in PUBLISHED and is_psf_id(psf):
         # A service may have the PSF, so that it need not be sent.
-        there = [] if service.server is None else service.get(f"/v1/psfs?name={psf}&limit=1")["items"]
-        return str(there[0]["id"] if there else service.upload_psf(kept_file(published_folder(), psf))["id"])
+        there = None if service.server is None else service.get(f"/v1/psfs?name={psf}&limit=1")["items"]
+        known = cast("list[Uploaded] | None", there)
+        return (known[0] if known else service.upload_psf(kept_file(published_folder(), psf)))["id"]
     if is_psf_id(psf):
         return whole_id(service, "psfs", psf)
-    return str(service.upload_psf(psf)["id"])
+    return service.upload_psf(psf)["id"]

@@ -220,7 +220,7 @@ def changes(
         check_outputs((table_file, sheet_file), inputs=(*files, psf_file), overwrite=overwrite)
     with connection() as service, progress_bar() as report:
         parameters["psf_id"] = named_psf(service, psf)
-        products: dict[str, dict[str, Any]] = {}
+        products: dict[str, dict[str, str]] = {}
         treated, failures = treat_many(
             files,
             _one_by_one(service, parameters, products),
@@ -243,7 +243,7 @@ def changes(
 
 
 def _one_by_one(
-    service: Operations, parameters: dict[str, Any], products: dict[str, dict[str, Any]]
+    service: Operations, parameters: dict[str, Any], products: dict[str, dict[str, str]]
 ) -> Callable[[str], Treated]:
     """A function that deconvolves one image with the service and measures what changed. The function adds the ids of
     the products to ``products``.

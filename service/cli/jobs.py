@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
 from service.cli.connection import (
     CHOSEN_SERVER,
     ID,
-    Row,
     id_argument,
     on_service,
     print_rows,
@@ -32,6 +31,7 @@ from service.client.errors import ServiceError
 from workers.contract.jobs import Phase
 
 if TYPE_CHECKING:
+    from service.client.answers import Job
     from service.client.http import Client
 
 # The name of a result and how to get it, by the part of its address that names the type of the result.
@@ -58,7 +58,7 @@ def job() -> None:
 def list_jobs(service: Client, phase: str | None, most: int) -> None:
     """List your jobs, newest first."""
 
-    def line(row: Row) -> str:
+    def line(row: Job) -> str:
         return f"{short(row['id'])}  {row['phase']:<9}  {row['kind']:<14}  {moment(row['created_at'])}  {_state(row)}"
 
     jobs = service.jobs() if phase is None else service.jobs(phase=phase)
@@ -77,9 +77,13 @@ def show(service: Client, identity: str, json_file: Path | None, overwrite: bool
     row = service.job(identity)
     echo(f"job {row['id']}: {row['kind']}, {row['phase']}")
     echo(f"  queue {row['queue']}, attempt {row['attempt']}")
-    for name in ("created", "started", "ended"):
-        if row[f"{name}_at"] is not None:
-            echo(f"  {name:<8} {moment(row[f'{name}_at'])}")
+    for name, at in (
+        ("created", row["created_at"]),
+        ("started", row["started_at"]),
+        ("ended", row["ended_at"]),
+    ):
+        if at is not None:
+            echo(f"  {name:<8} {moment(at)}")
     for name, value in row["parameters"].items():
         if value is not None:
             echo(f"  {name} {_value(value)}")
@@ -193,7 +197,7 @@ def delete(service: Client, identities: tuple[str, ...]) -> None:
         echo(f"product {short(whole)} is deleted")
 
 
-def _state(row: Row) -> str:
+def _state(row: Job) -> str:
     """The progress, result or error of a job in one line; empty for a job that waits."""
     if row["error"] is not None:
         return str(row["error"]["message"])
@@ -212,7 +216,7 @@ def _state(row: Row) -> str:
     return f"{step_text(now['stage'], now['step'], now['steps'])}{left}"
 
 
-def _value(value: Any) -> str:
+def _value(value: object) -> str:
     """A parameter in one line: an id is shortened, and a long text is cut."""
     text = str(value)
     if isinstance(value, str) and len(text) == 64 and set(text) <= set("0123456789abcdef"):

@@ -14,9 +14,8 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from psfcore import limited
 from psfcore.compiled import listening
@@ -34,6 +33,7 @@ from psfcore.instruments.unknown import unknown_instrument
 from psfcore.instruments.workload import check_workload
 from psfcore.transit.archive import list_archive, transit_in
 from service.cli.local_workspace import ImageFile, Inputs, LocalWorkspace, PsfFile, TransitFiles, states_of
+from service.client.answers import Ended, Json, Submitted, Uploaded
 from service.client.errors import ServiceError
 from service.client.operations import Operations, Progress, named_instrument
 from service.client.outputs import written
@@ -47,9 +47,11 @@ from workers.contract.identities import (
 )
 from workers.contract.kinds import KINDS, JobRequest, ResultType
 from workers.contract.requests import (
+    CrossValidate,
     Deconvolve,
     GapDiagnose,
     PsfBuild,
+    PsfFit,
     Report,
     ResolvedDeconvolve,
 )
@@ -75,9 +77,9 @@ class Local(Operations):
     gap_effects: str = ""
     times: StageTimer = field(default_factory=StageTimer)
     inputs: Inputs = field(default_factory=Inputs)
-    _jobs: dict[str, Any] = field(default_factory=dict)  # resolved parameters
+    _jobs: dict[str, BaseModel] = field(default_factory=dict)  # resolved parameters
 
-    def upload_image(self, path: str | Path) -> dict[str, Any]:
+    def upload_image(self, path: str | Path) -> Uploaded:
         """Add an image, after the same check of its header as in a service."""
         summary = read_summary(path, LIMITS)
         if summary.codec is not None:
@@ -89,9 +91,9 @@ class Local(Operations):
 
     def image_id(self, path: str | Path, sha256: str) -> str:
         """Add an image; returns its id."""
-        return str(self.upload_image(path)["id"])
+        return self.upload_image(path)["id"]
 
-    def upload_transit(self, path: str | Path) -> dict[str, Any]:
+    def upload_transit(self, path: str | Path) -> Uploaded:
         """Add a transit, after the same check of its table of contents as in a service."""
         path = Path(path)
         if path.is_dir():
@@ -107,7 +109,7 @@ class Local(Operations):
         self.inputs.transits[transit.sha256] = transit
         return {"id": transit.sha256}
 
-    def upload_psf(self, path: str | Path, **described: Any) -> dict[str, Any]:
+    def upload_psf(self, path: str | Path, **described: str | None) -> Uploaded:
         """Add a PSF, and read it. As in a service, a PSF that heliopsf made keeps its id. No command describes the PSF
         anew.
         """
@@ -130,17 +132,17 @@ class Local(Operations):
         self.inputs.builds[psf_identity(build)] = build
         return psf_identity(build)
 
-    def submit(self, kind: str, **parameters: Any) -> dict[str, Any]:
+    def submit(self, kind: str, **parameters: object) -> Submitted:
         """Check a request; ``wait`` computes its result."""
         job_id = uuid.uuid4().hex
         self._jobs[job_id] = self._resolved(kind, parameters)[0]
         return {"id": job_id, "kind": kind}
 
-    def result_id(self, kind: str, **parameters: Any) -> str:
+    def result_id(self, kind: str, **parameters: object) -> str:
         """The id that the result of a request has. Nothing is computed."""
         return self._resolved(kind, parameters)[1]
 
-    def wait(self, job: dict[str, Any], *, progress: Progress | None = None) -> dict[str, Any]:
+    def wait(self, job: Submitted, *, progress: Progress | None = None) -> Ended:
         """Compute the result of a request. The progress of a job that counts several times is the percent of its
         estimated time, and after this time the steps of its stage.
         """
@@ -163,7 +165,7 @@ class Local(Operations):
         kind = KINDS[job["kind"]]
         with listening(compiling):
             identity = kind.load_task()(self._workspace(job["id"], report), request.model_dump())
-        return job | {"result": f"{kind.result}/{identity}"}
+        return {"result": f"{kind.result}/{identity}"}
 
     def _workspace(self, job_id: str, report: Progress = lambda *_: None) -> LocalWorkspace:
         return LocalWorkspace(self.inputs, self._settings, job_id, report, self.times)
@@ -172,14 +174,15 @@ class Local(Operations):
     def _settings(self) -> Settings:
         return Settings.apart(self.folder, gap_effects=self.gap_effects)
 
-    def _expected_s(self, kind: str, request: Any) -> float | None:
+    def _expected_s(self, kind: str, request: BaseModel) -> float | None:
         """The estimated time of a job on a transit, s; None for other jobs, whose steps count the whole job."""
-        if KINDS[kind].counted_whole or getattr(request, "transit_id", None) not in self.inputs.transits:
+        transit = self.inputs.transits.get(getattr(request, "transit_id", ""))
+        if KINDS[kind].counted_whole or transit is None:
             return None
-        pixels = self.inputs.transits[request.transit_id].contents.pixels
+        pixels = transit.contents.pixels
         return job_s(kind, request.model_dump(), pixels) / cores()
 
-    def get(self, address: str) -> dict[str, Any]:
+    def get(self, address: str) -> dict[str, Json]:
         """The description of a result."""
         beginning, _, identity = address.rpartition("/")
         result = self.inputs.results.get((ResultType(beginning), identity))
@@ -194,11 +197,11 @@ class Local(Operations):
         with written(path, overwrite=overwrite) as partial_file:
             self.inputs.results[ResultType(beginning), identity].files[name](partial_file)
 
-    def release(self, product: dict[str, Any]) -> None:
+    def release(self, product: Uploaded) -> None:
         """Forget a product, which would use memory otherwise."""
         del self.inputs.results[ResultType.PRODUCT, product["id"]]
 
-    def _resolved(self, kind: str, parameters: dict[str, Any]) -> tuple[Any, str]:
+    def _resolved(self, kind: str, parameters: dict[str, object]) -> tuple[BaseModel, str]:
         """The resolved parameters of a request, and the id of its result."""
         body = {"kind": kind, "parameters": parameters}
         try:
@@ -213,6 +216,7 @@ class Local(Operations):
         if isinstance(request.parameters, PsfBuild):
             return self._resolved_build(request.parameters), psf_identity(request.parameters)
         of_kind = KINDS[kind]
+        assert isinstance(request.parameters, PsfFit | CrossValidate | GapDiagnose | Report)
         assert of_kind.resolved is not None and of_kind.identity is not None
         fields = request.parameters.model_dump() | self._resolved_on_transit(request.parameters)
         resolved = of_kind.resolved.model_validate(fields)
@@ -224,7 +228,9 @@ class Local(Operations):
         check_workload(parse_instrument(instrument_text(build), label), label)
         return build
 
-    def _resolved_on_transit(self, request: Any) -> dict[str, Any]:
+    def _resolved_on_transit(
+        self, request: PsfFit | CrossValidate | GapDiagnose | Report
+    ) -> dict[str, object]:
         """The further fields of a resolved request on a transit, as ``workers.intake.requests`` finds them in a
         catalogue.
         """
@@ -232,7 +238,7 @@ class Local(Operations):
         if isinstance(request, Report) and request.psf_id is not None:
             check_noise(manifest, request.noise)
             return {"dark_offsets": False}  # no fit is made
-        fields: dict[str, Any] = {"diffraction_recipe": diffraction_build(manifest, request.noise)}
+        fields: dict[str, object] = {"diffraction_recipe": diffraction_build(manifest, request.noise)}
         if isinstance(request, GapDiagnose):
             effects = self._settings.added_effects
             hashes = tuple(map(sha256_of_source, effects))
@@ -251,7 +257,7 @@ class Local(Operations):
                 f"expected the id or name of a context; got {request.context!r}, which does not exist: list the "
                 "contexts",
             )
-        psf: dict[str, Any] = {"psf_id": request.psf_id}
+        psf: dict[str, object] = {"psf_id": request.psf_id}
         if request.psf_id is None:
             if summary.instrument is None:
                 raise unknown_instrument(asdict(summary))
@@ -259,7 +265,7 @@ class Local(Operations):
             psf = {"psf_id": psf_identity(recipe), "psf_recipe": recipe}
         elif request.psf_id not in self.inputs.psfs | self.inputs.builds:
             raise no_such("psf", request.psf_id)
-        return ResolvedDeconvolve(**psf, **request.model_dump(exclude={"psf_id", "context"}))
+        return ResolvedDeconvolve.model_validate(psf | request.model_dump(exclude={"psf_id", "context"}))
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import wraps
 from importlib.util import find_spec
@@ -34,6 +34,7 @@ from workers.contract.requests import METHOD_MODELS, METHODS, Deconvolve, Defaul
 
 if TYPE_CHECKING:
     from psfcore.fits.blocks import FitsLimits
+    from service.client.answers import Product
     from workers.settings import Settings
 
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -284,7 +285,7 @@ def is_local() -> bool:
     return context is not None and bool(context.meta.get(LOCAL))
 
 
-def say_warnings(product: dict[str, Any]) -> None:
+def say_warnings(product: Product) -> None:
     """Print the warnings of a product to standard error."""
     for warning in product["details"]["warnings"]:
         echo(f"warning: {warning['message']}", err=True)
@@ -341,7 +342,7 @@ def check_fresh_folder(folder: Path, inputs: Sequence[Path] = (), *, overwrite: 
     check_output_folder(folder)
 
 
-def write_json(path: Path | None, content: dict[str, Any], *, overwrite: bool = False) -> None:
+def write_json(path: Path | None, content: Mapping[str, object], *, overwrite: bool = False) -> None:
     """Write ``content`` as ``write_file`` does."""
     if path is not None:
         text = json.dumps(content, indent=1, allow_nan=False) + "\n"

@@ -9,7 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 import click
@@ -30,6 +30,7 @@ from service.client.outputs import check_outputs
 from workers.contract.jobs import Queue, queues_named
 
 if TYPE_CHECKING:
+    from service.client.answers import Product
     from service.client.http import Client
 
 # Longer than HELIOPSF_LEASE_S and HELIOPSF_RECONCILE_S together: the job of a lost worker is then found before others
@@ -194,9 +195,7 @@ def run_demo(image: Path | None, output: Path, progress: Progress) -> list[str]:
     return demo_lines(output, image, product_file, picture, product)
 
 
-def demo_lines(
-    output: Path, image: Path, product_file: Path, picture: Path, product: dict[str, Any]
-) -> list[str]:
+def demo_lines(output: Path, image: Path, product_file: Path, picture: Path, product: Product) -> list[str]:
     """What the demo prints at its end: its files, what changed, and how to look at the product in a browser."""
     change = product["details"]
     return [

@@ -10,15 +10,16 @@ import json
 import os
 import re
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import httpx
 
 from psfcore.files import sha256_of
+from service.client.answers import AnyAnswer, Health, Json
 from service.client.errors import (
     DEFAULT_SERVER,
     FIRST_WAIT_S,
@@ -90,7 +91,7 @@ class Connection:
         """Close the connection."""
         self._http.close()
 
-    def health(self) -> dict[str, Any]:
+    def health(self) -> Health:
         """Ask whether the service is up.
 
         Returns
@@ -103,7 +104,7 @@ class Connection:
         ServiceError
             "database-away" or "reconciler-stopped", or there was no answer.
         """
-        return self.get("/healthz")
+        return self._json(Health, "GET", "/healthz")
 
     def wait_until_up(self, timeout_s: float = 60.0) -> None:
         """Wait until the service is up.
@@ -128,7 +129,7 @@ class Connection:
                     raise
                 time.sleep(0.1)
 
-    def get(self, address: str) -> dict[str, Any]:
+    def get(self, address: str) -> dict[str, Json]:
         """Get the description at an address of the service.
 
         Parameters
@@ -146,7 +147,7 @@ class Connection:
         ServiceError
             "no-such-product", "no-such-psf" or another code of the address.
         """
-        return self._json("GET", address)
+        return self._json(dict[str, Json], "GET", address)
 
     def download(self, address: str, path: str | Path, *, overwrite: bool = False) -> None:
         """Download a file of the service.
@@ -178,7 +179,7 @@ class Connection:
                 file.write(chunk)
             _check_digest(response, digest.digest())
 
-    def follow(self, address: str) -> Iterator[dict[str, Any]]:
+    def follow(self, address: str) -> Iterator[dict[str, Json]]:
         """Follow a job or a bulk run until it ends.
 
         Parameters
@@ -211,7 +212,7 @@ class Connection:
 
     def events(
         self, *, jobs: Sequence[str] = (), bulks: Sequence[str] = ()
-    ) -> Iterator[tuple[str, dict[str, Any]]]:
+    ) -> Iterator[tuple[str, dict[str, Json]]]:
         """Follow all your jobs and bulk runs.
 
         Parameters
@@ -260,22 +261,22 @@ class Connection:
             else:
                 time.sleep(FIRST_WAIT_S)
 
-    def _all(self, address: str, filters: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    def _all(self, kind: type[AnyAnswer], address: str, filters: Mapping[str, object]) -> Iterator[AnyAnswer]:
         """All items of a list."""
-        page = self._json("GET", address, params={"limit": "200", **filters})
+        page = self._json(dict[str, Json], "GET", address, params={"limit": "200", **filters})
         while True:
-            yield from page["items"]
+            yield from cast("list[AnyAnswer]", page["items"])
             if page["next"] is None:
                 return
-            page = self.get(page["next"])
+            page = self.get(str(page["next"]))
 
-    def _json(self, method: str, address: str, **options: Any) -> dict[str, Any]:
-        """The description that a request answers."""
-        body: dict[str, Any] = self._answer(method, address, **options).json()
+    def _json(self, _kind: type[AnyAnswer], method: str, address: str, **options: Any) -> AnyAnswer:
+        """The JSON that a request answers. _kind: its form."""
+        body: AnyAnswer = self._answer(method, address, **options).json()
         return body
 
     def _answer(
-        self, method: str, address: str, *, params: dict[str, Any] | None = None, **options: Any
+        self, method: str, address: str, *, params: Mapping[str, Any] | None = None, **options: Any
     ) -> httpx.Response:
         """The answer to a request. A parameter whose value is None is not sent."""
         with self._reached():

@@ -10,10 +10,46 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 from psfcore.errors import DataError
 from psfcore.transit.archive import pack
+from service.client.answers import (
+    Affected,
+    Ancestor,
+    AnnulusAnswer,
+    AnyAnswer,
+    Bulk,
+    BulkEstimate,
+    BulkFailure,
+    BulkLine,
+    BulkResult,
+    Choice,
+    ComparisonAnswer,
+    Context,
+    ContextLine,
+    CurveAnswer,
+    DefaultContext,
+    EncircledAnswer,
+    HduHeader,
+    Identified,
+    Image,
+    Job,
+    JobEstimate,
+    Json,
+    Key,
+    MadeKey,
+    Product,
+    ProfileAnswer,
+    Psf,
+    PsfStatus,
+    Report,
+    Series,
+    SeriesLine,
+    Submitted,
+    Transit,
+    Uploaded,
+)
 from service.client.connection import FROM_BYTES, GOES_ON, Connection, upload_in_parts
 from service.client.errors import SHOWN_DIGITS, Patience, ServiceError, WaitInterrupted
 from service.client.operations import Operations, Progress, without_none
@@ -57,10 +93,10 @@ class Client(Connection, Operations):
 
     # Uploads -----------------------------------------------------------------------------------
 
-    def upload_image(self, path: str | Path) -> dict[str, Any]:
-        return self._upload("/v1/images", Path(path))
+    def upload_image(self, path: str | Path) -> Image:
+        return self._upload(Image, "/v1/images", Path(path))
 
-    def upload_transit(self, path: str | Path) -> dict[str, Any]:
+    def upload_transit(self, path: str | Path) -> Transit:
         """Upload a transit.
 
         Parameters
@@ -87,8 +123,10 @@ class Client(Connection, Operations):
         """
         with _as_archive(Path(path)) as archive:
             if archive.stat().st_size < FROM_BYTES:
-                return self._upload("/v1/transits", archive, media_type="application/octet-stream")
-            return self.get(upload_in_parts(self._answer, archive, "transit", archive.name, self.say))
+                return self._upload(Transit, "/v1/transits", archive, media_type="application/octet-stream")
+            return self._json(
+                Transit, "GET", upload_in_parts(self._answer, archive, "transit", archive.name, self.say)
+            )
 
     def upload_psf(
         self,
@@ -99,7 +137,7 @@ class Client(Connection, Operations):
         instrument: str | None = None,
         channel: str | None = None,
         kind: str | None = None,
-    ) -> dict[str, Any]:
+    ) -> Psf:
         described = {
             "name": name,
             "version": version,
@@ -107,7 +145,7 @@ class Client(Connection, Operations):
             "channel": channel,
             "kind": kind,
         }
-        return self._upload("/v1/psfs", Path(path), described)
+        return self._upload(Psf, "/v1/psfs", Path(path), described)
 
     def image_id(self, path: str | Path, sha256: str) -> str:
         try:
@@ -119,24 +157,26 @@ class Client(Connection, Operations):
 
     def _upload(
         self,
+        kind: type[AnyAnswer],
         address: str,
         path: Path,
-        query: dict[str, Any] | None = None,
+        query: Mapping[str, object] | None = None,
         *,
         media_type: str = "application/fits",
-    ) -> dict[str, Any]:
+    ) -> AnyAnswer:
         with path.open("rb") as file:
             return self._json(
+                kind,
                 "POST",
                 address,
-                params={"filename": path.name} | (query or {}),
+                params={"filename": path.name, **(query or {})},
                 content=iter(lambda: file.read(2**20), b""),
                 headers={"Content-Type": media_type, "Content-Length": str(path.stat().st_size)},
             )
 
     # Jobs --------------------------------------------------------------------------------------
 
-    def submit(self, kind: str, *, queue: str | None = None, **parameters: Any) -> dict[str, Any]:
+    def submit(self, kind: str, *, queue: str | None = None, **parameters: object) -> Job:
         """Submit a job.
 
         Parameters
@@ -162,9 +202,9 @@ class Client(Connection, Operations):
             deconvolution also "no-psf-for-instrument", "already-deconvolved", "channel-mismatch" or
             "plate-scale-mismatch".
         """
-        return self._job("/v1/jobs", kind, queue=queue, parameters=parameters)
+        return self._job(Job, "/v1/jobs", kind, queue=queue, parameters=parameters)
 
-    def estimate(self, kind: str, *, queue: str | None = None, **parameters: Any) -> dict[str, Any]:
+    def estimate(self, kind: str, *, queue: str | None = None, **parameters: object) -> JobEstimate:
         """Estimate a job without starting it.
 
         Parameters
@@ -190,15 +230,15 @@ class Client(Connection, Operations):
         ServiceError
             The errors of ``submit``.
         """
-        return self._job("/v1/estimates", kind, queue=queue, parameters=parameters)
+        return self._job(JobEstimate, "/v1/estimates", kind, queue=queue, parameters=parameters)
 
-    def result_id(self, kind: str, **parameters: Any) -> str:
-        return str(self._job("/v1/jobs/identity", kind, parameters=parameters)["result_id"])
+    def result_id(self, kind: str, **parameters: object) -> str:
+        return self._job(Identified, "/v1/jobs/identity", kind, parameters=parameters)["result_id"]
 
-    def _job(self, address: str, kind: str, **body: Any) -> dict[str, Any]:
-        return self._json("POST", address, json={"kind": kind, **body})
+    def _job(self, answer: type[AnyAnswer], address: str, kind: str, **body: object) -> AnyAnswer:
+        return self._json(answer, "POST", address, json={"kind": kind, **body})
 
-    def job(self, job_id: str) -> dict[str, Any]:
+    def job(self, job_id: str) -> Job:
         """Get the current description of a job.
 
         Parameters
@@ -216,9 +256,9 @@ class Client(Connection, Operations):
         ServiceError
             "no-such-job".
         """
-        return self.get(f"/v1/jobs/{job_id}")
+        return self._json(Job, "GET", f"/v1/jobs/{job_id}")
 
-    def jobs(self, **filters: str) -> Iterator[dict[str, Any]]:
+    def jobs(self, **filters: str) -> Iterator[Job]:
         """List your jobs, newest first.
 
         Parameters
@@ -231,9 +271,9 @@ class Client(Connection, Operations):
         iterator of dict
             Their descriptions.
         """
-        return self._all("/v1/jobs", filters)
+        return self._all(Job, "/v1/jobs", filters)
 
-    def cancel(self, job_id: str) -> dict[str, Any]:
+    def cancel(self, job_id: str) -> Job:
         """Cancel a job.
 
         Parameters
@@ -251,11 +291,11 @@ class Client(Connection, Operations):
         ServiceError
             "no-such-job", or "job-of-bulk" for a part of a bulk run.
         """
-        return self._json("DELETE", f"/v1/jobs/{job_id}")
+        return self._json(Job, "DELETE", f"/v1/jobs/{job_id}")
 
     def wait(
-        self, job: dict[str, Any], *, progress: Progress | None = None, timeout_s: float | None = None
-    ) -> dict[str, Any]:
+        self, job: Submitted, *, progress: Progress | None = None, timeout_s: float | None = None
+    ) -> Job:
         """Wait until a job is completed.
 
         Parameters
@@ -285,33 +325,34 @@ class Client(Connection, Operations):
         -----
         If the service does not answer, for example while it is restarted, the client tries again for ten minutes.
         """
-        started, in_queue_said, job_id = time.monotonic(), False, job["id"]
+        started, in_queue_said = time.monotonic(), False
+        now = cast("Job", job)  # over HTTP, `submit` returns the whole description
         try:
-            while job["phase"] in ("QUEUED", "EXECUTING"):
+            while now["phase"] in ("QUEUED", "EXECUTING"):
                 waited_s = time.monotonic() - started
                 if timeout_s is not None and waited_s > timeout_s:
                     raise TimeoutError(
-                        f"job {job['id']} is {job['phase']} after {timeout_s:g} s and continues: wait for it again"
+                        f"job {now['id']} is {now['phase']} after {timeout_s:g} s and continues: wait for it again"
                     )
-                if job["phase"] == "QUEUED" and waited_s > QUEUED_S and not in_queue_said:
-                    self.say(f"job {job['id'][:SHOWN_DIGITS]} waits in the queue {job['queue']}")
+                if now["phase"] == "QUEUED" and waited_s > QUEUED_S and not in_queue_said:
+                    self.say(f"job {now['id'][:SHOWN_DIGITS]} waits in the queue {now['queue']}")
                     in_queue_said = True
                 time.sleep(0.1)
-                job = Patience(self.say, GOES_ON).repeat(lambda: self.job(job_id))
-                now = job["progress"]
-                if progress is not None and now["stage"]:
-                    share = now["share"]
+                now = Patience(self.say, GOES_ON).repeat(lambda: self.job(job["id"]))
+                done = now["progress"]
+                if progress is not None and done["stage"]:
+                    share = done["share"]
                     if share is None:
-                        progress(now["stage"], now["step"], max(now["steps"], 1))
+                        progress(done["stage"], done["step"], max(done["steps"], 1))
                     else:
-                        progress(now["stage"], int(100 * share), 100)
+                        progress(done["stage"], int(100 * share), 100)
         except KeyboardInterrupt as stop:
             raise WaitInterrupted("job", job["id"], self.server) from stop
-        return self._ended(job)
+        return self._ended(now)
 
     def rerun(
         self, of: Literal["psf", "product"], identity: str, *, progress: Progress | None = None
-    ) -> dict[str, Any]:
+    ) -> Report:
         """Make a PSF or a product again and compare it with the first one.
 
         Parameters
@@ -334,11 +375,11 @@ class Client(Connection, Operations):
             "no-such-psf", "no-such-product", "not-made-here" for an upload, "parameters-unknown" or
             "parameters-outdated".
         """
-        return self.run("rerun", {"of": of, "id": identity}, progress)
+        return cast("Report", self.run("rerun", {"of": of, "id": identity}, progress))
 
     # Images and products -----------------------------------------------------------------------
 
-    def product(self, product_id: str) -> dict[str, Any]:
+    def product(self, product_id: str) -> Product:
         """Get the description of a product.
 
         Parameters
@@ -356,9 +397,9 @@ class Client(Connection, Operations):
         ServiceError
             "no-such-product".
         """
-        return self.get(f"/v1/products/{product_id}")
+        return self._json(Product, "GET", f"/v1/products/{product_id}")
 
-    def products(self, **filters: str) -> Iterator[dict[str, Any]]:
+    def products(self, **filters: str) -> Iterator[Product]:
         """List products, newest first.
 
         Parameters
@@ -371,7 +412,7 @@ class Client(Connection, Operations):
         iterator of dict
             Their descriptions.
         """
-        return self._all("/v1/products", filters)
+        return self._all(Product, "/v1/products", filters)
 
     def delete_product(self, product_id: str) -> None:
         """Delete a product. The same request makes it again.
@@ -388,7 +429,7 @@ class Client(Connection, Operations):
         """
         self._answer("DELETE", f"/v1/products/{product_id}")
 
-    def release(self, product: dict[str, Any]) -> None:
+    def release(self, product: Uploaded) -> None:
         """Do nothing: the service keeps its products.
 
         Parameters
@@ -444,7 +485,7 @@ class Client(Connection, Operations):
         ny, nx = map(int, answer.headers["x-pixels-shape"].split(","))
         return np.frombuffer(answer.content, dtype="<f4").astype(np.float32).reshape(ny, nx)
 
-    def image_header(self, image_id: str) -> list[dict[str, Any]]:
+    def image_header(self, image_id: str) -> list[HduHeader]:
         """Get the header of each HDU of an uploaded image.
 
         Parameters
@@ -464,7 +505,7 @@ class Client(Connection, Operations):
         """
         return self._header(f"/v1/images/{image_id}")
 
-    def product_header(self, product_id: str) -> list[dict[str, Any]]:
+    def product_header(self, product_id: str) -> list[HduHeader]:
         """Get the header of each HDU of a product.
 
         Parameters
@@ -484,9 +525,8 @@ class Client(Connection, Operations):
         """
         return self._header(f"/v1/products/{product_id}")
 
-    def _header(self, address: str) -> list[dict[str, Any]]:
-        hdus: list[dict[str, Any]] = self._answer("GET", f"{address}/header").json()
-        return hdus
+    def _header(self, address: str) -> list[HduHeader]:
+        return self._json(list[HduHeader], "GET", f"{address}/header")
 
     def thumbnail(self, product_id: str, output: str | Path, *, overwrite: bool = False) -> None:
         """Write the small picture of a product (PNG, at most 192 px).
@@ -507,7 +547,7 @@ class Client(Connection, Operations):
         """
         self.download(f"/v1/products/{product_id}/thumbnail", output, overwrite=overwrite)
 
-    def lineage(self, of: Literal["psf", "product"], identity: str) -> dict[str, Any]:
+    def lineage(self, of: Literal["psf", "product"], identity: str) -> Ancestor:
         """Get the images, transits and PSFs of which a PSF or product was made.
 
         Parameters
@@ -527,7 +567,7 @@ class Client(Connection, Operations):
         ServiceError
             "no-such-psf" or "no-such-product".
         """
-        return self.get(f"/v1/{of}s/{identity}/lineage")
+        return self._json(Ancestor, "GET", f"/v1/{of}s/{identity}/lineage")
 
     def provenance(
         self, of: Literal["psf", "product"], identity: str, output: str | Path, *, overwrite: bool = False
@@ -555,7 +595,7 @@ class Client(Connection, Operations):
 
     # PSFs and their versions -------------------------------------------------------------------
 
-    def psf(self, psf_id: str) -> dict[str, Any]:
+    def psf(self, psf_id: str) -> Psf:
         """Get the description of a PSF version.
 
         Parameters
@@ -573,9 +613,9 @@ class Client(Connection, Operations):
         ServiceError
             "no-such-psf".
         """
-        return self.get(f"/v1/psfs/{psf_id}")
+        return self._json(Psf, "GET", f"/v1/psfs/{psf_id}")
 
-    def psfs(self, **filters: str) -> Iterator[dict[str, Any]]:
+    def psfs(self, **filters: str) -> Iterator[Psf]:
         """List PSF versions, newest first.
 
         Parameters
@@ -593,9 +633,9 @@ class Client(Connection, Operations):
         ServiceError
             "no-such-context", or "not-valid-at-any-time" for ``valid_at`` with another ``status`` than "certified".
         """
-        return self._all("/v1/psfs", filters)
+        return self._all(Psf, "/v1/psfs", filters)
 
-    def psf_curve(self, psf_id: str, radii: Sequence[float] | None = None) -> dict[str, Any]:
+    def psf_curve(self, psf_id: str, radii: Sequence[float] | None = None) -> CurveAnswer:
         """Get the light beyond radii: 1 - encircled energy.
 
         Parameters
@@ -615,9 +655,11 @@ class Client(Connection, Operations):
         ServiceError
             "no-such-psf", "bad-radius" or "radius-beyond-reach".
         """
-        return self.answer([psf_id], "curve", {} if radii is None else {"radii": list(radii)})
+        return cast(
+            "CurveAnswer", self.answer([psf_id], "curve", {} if radii is None else {"radii": list(radii)})
+        )
 
-    def psf_profile(self, psf_id: str) -> dict[str, Any]:
+    def psf_profile(self, psf_id: str) -> ProfileAnswer:
         """Get the mean weight of the pixels at each radius.
 
         Parameters
@@ -636,9 +678,9 @@ class Client(Connection, Operations):
         ServiceError
             "no-such-psf".
         """
-        return self.answer([psf_id], "profile", {})
+        return cast("ProfileAnswer", self.answer([psf_id], "profile", {}))
 
-    def psf_encircled(self, psf_id: str, radius: float) -> dict[str, Any]:
+    def psf_encircled(self, psf_id: str, radius: float) -> EncircledAnswer:
         """Get the light within a radius.
 
         Parameters
@@ -658,9 +700,9 @@ class Client(Connection, Operations):
         ServiceError
             "no-such-psf", "bad-radius" or "radius-beyond-reach".
         """
-        return self.answer([psf_id], "encircled", {"radius": radius})
+        return cast("EncircledAnswer", self.answer([psf_id], "encircled", {"radius": radius}))
 
-    def psf_annulus(self, psf_id: str, inner: float, outer: float) -> dict[str, Any]:
+    def psf_annulus(self, psf_id: str, inner: float, outer: float) -> AnnulusAnswer:
         """Get the light between two radii.
 
         Parameters
@@ -680,9 +722,9 @@ class Client(Connection, Operations):
         ServiceError
             "no-such-psf", "bad-annulus", "bad-radius" or "radius-beyond-reach".
         """
-        return self.answer([psf_id], "annulus", {"inner": inner, "outer": outer})
+        return cast("AnnulusAnswer", self.answer([psf_id], "annulus", {"inner": inner, "outer": outer}))
 
-    def compare_psfs(self, psf_id: str, other_id: str) -> dict[str, Any]:
+    def compare_psfs(self, psf_id: str, other_id: str) -> ComparisonAnswer:
         """Compare two PSFs: the second minus the first.
 
         Parameters
@@ -701,9 +743,9 @@ class Client(Connection, Operations):
         ServiceError
             "no-such-psf" or "plate-scale-mismatch".
         """
-        return self.answer([psf_id, other_id], f"compare/{other_id}", {})
+        return cast("ComparisonAnswer", self.answer([psf_id, other_id], f"compare/{other_id}", {}))
 
-    def answer(self, psf_ids: list[str], question: str, query: dict[str, Any]) -> dict[str, Any]:
+    def answer(self, psf_ids: list[str], question: str, query: Mapping[str, object]) -> dict[str, Json]:
         """Get the answer to a question on PSFs. If tables are missing, they are made first.
 
         Parameters
@@ -731,13 +773,13 @@ class Client(Connection, Operations):
             for name, value in query.items()
         }
         try:
-            return self._json("GET", address, params=parameters)
+            return self._json(dict[str, Json], "GET", address, params=parameters)
         except ServiceError as error:
             if error.code != "no-tables":
                 raise
         for psf_id in psf_ids:
             self.wait(self.submit("psf-tables", psf_id=psf_id))
-        return self._json("GET", address, params=parameters)
+        return self._json(dict[str, Json], "GET", address, params=parameters)
 
     def psf_cutout(self, psf_id: str, size: int, output: str | Path, *, overwrite: bool = False) -> None:
         """Write the central part of a PSF (FITS).
@@ -760,7 +802,7 @@ class Client(Connection, Operations):
         """
         self.download(f"/v1/psfs/{psf_id}/cutout?size={size}", output, overwrite=overwrite)
 
-    def psf_status(self, psf_id: str) -> dict[str, Any]:
+    def psf_status(self, psf_id: str) -> PsfStatus:
         """Get the status of a PSF and its history.
 
         Parameters
@@ -779,7 +821,7 @@ class Client(Connection, Operations):
         ServiceError
             "no-such-psf".
         """
-        return self.get(f"/v1/psfs/{psf_id}/status")
+        return self._json(PsfStatus, "GET", f"/v1/psfs/{psf_id}/status")
 
     def certify_psf(
         self,
@@ -791,7 +833,7 @@ class Client(Connection, Operations):
         supersedes: Sequence[str] = (),
         reason: str = "",
         **series: str | None,
-    ) -> dict[str, Any]:
+    ) -> PsfStatus:
         """Certify a draft, or change the time range of a certified PSF.
 
         Parameters
@@ -824,7 +866,7 @@ class Client(Connection, Operations):
         change = {"version": version, "valid_from": valid_from, "valid_to": valid_to, **series}
         return self._set_status(psf_id, "certified", supersedes=list(supersedes), reason=reason, **change)
 
-    def deprecate_psf(self, psf_id: str, successor: str | None = None, *, reason: str = "") -> dict[str, Any]:
+    def deprecate_psf(self, psf_id: str, successor: str | None = None, *, reason: str = "") -> PsfStatus:
         """Deprecate a certified PSF, or name the successor of a deprecated PSF.
 
         Parameters
@@ -848,10 +890,10 @@ class Client(Connection, Operations):
         """
         return self._set_status(psf_id, "deprecated", successor=successor, reason=reason)
 
-    def _set_status(self, psf_id: str, status: str, **change: Any) -> dict[str, Any]:
-        return self._json("POST", f"/v1/psfs/{psf_id}/status", json={"status": status, **change})
+    def _set_status(self, psf_id: str, status: str, **change: object) -> PsfStatus:
+        return self._json(PsfStatus, "POST", f"/v1/psfs/{psf_id}/status", json={"status": status, **change})
 
-    def delete_psf(self, psf_id: str) -> dict[str, Any]:
+    def delete_psf(self, psf_id: str) -> Psf:
         """Delete a draft that nothing uses.
 
         Parameters
@@ -869,9 +911,9 @@ class Client(Connection, Operations):
         ServiceError
             "no-such-psf", "not-a-draft" or "psf-in-use".
         """
-        return self._json("DELETE", f"/v1/psfs/{psf_id}")
+        return self._json(Psf, "DELETE", f"/v1/psfs/{psf_id}")
 
-    def best_psf(self, **filters: str | None) -> dict[str, Any]:
+    def best_psf(self, **filters: str | None) -> Choice:
         """Get the one PSF that meets filters.
 
         Parameters
@@ -890,9 +932,9 @@ class Client(Connection, Operations):
         ServiceError
             "no-psf-fits", "several-psfs-fit", "no-such-context" or "not-valid-at-any-time".
         """
-        return self._json("GET", "/v1/psfs/best", params=filters)
+        return self._json(Choice, "GET", "/v1/psfs/best", params=filters)
 
-    def psf_for_image(self, image_id: str, **where: str | None) -> dict[str, Any]:
+    def psf_for_image(self, image_id: str, **where: str | None) -> Choice:
         """Get the PSF that fits the header of an uploaded image.
 
         Parameters
@@ -913,9 +955,9 @@ class Client(Connection, Operations):
             "no-such-image", "no-such-context", "no-instrument", "no-date", "no-psf-fits", "several-psfs-fit" or
             "several-variants-fit".
         """
-        return self._json("GET", f"/v1/images/{image_id}/psf", params=where)
+        return self._json(Choice, "GET", f"/v1/images/{image_id}/psf", params=where)
 
-    def affected(self, psf_id: str | None = None, *, superseded: bool = False) -> Iterator[dict[str, Any]]:
+    def affected(self, psf_id: str | None = None, *, superseded: bool = False) -> Iterator[Affected]:
         """List the products that were made with a PSF, or with any deprecated PSF.
 
         Parameters
@@ -937,10 +979,10 @@ class Client(Connection, Operations):
             "no-such-psf".
         """
         if psf_id is not None:
-            return self._all(f"/v1/psfs/{psf_id}/affected", {})
-        return self._all("/v1/affected", {"superseded": superseded})
+            return self._all(Affected, f"/v1/psfs/{psf_id}/affected", {})
+        return self._all(Affected, "/v1/affected", {"superseded": superseded})
 
-    def series(self) -> Iterator[dict[str, Any]]:
+    def series(self) -> Iterator[SeriesLine]:
         """List the series of which a PSF was certified, by name.
 
         Returns
@@ -948,11 +990,9 @@ class Client(Connection, Operations):
         iterator of dict
             For each ``series`` (instrument/channel/kind), and whether its PSFs may be ``interpolated``.
         """
-        return self._all("/v1/series", {})
+        return self._all(SeriesLine, "/v1/series", {})
 
-    def interpolate_series(
-        self, series: str, interpolated: bool = True, *, reason: str = ""
-    ) -> dict[str, Any]:
+    def interpolate_series(self, series: str, interpolated: bool = True, *, reason: str = "") -> Series:
         """Say whether the PSFs of a series may be interpolated in time.
 
         Parameters
@@ -975,7 +1015,7 @@ class Client(Connection, Operations):
             "no-such-series", or "series-not-total" if the series is one of components.
         """
         body = {"interpolated": interpolated, "reason": reason}
-        return self._json("PUT", f"/v1/series/{series}", json=body)
+        return self._json(Series, "PUT", f"/v1/series/{series}", json=body)
 
     def interpolate_psf(
         self,
@@ -986,7 +1026,7 @@ class Client(Connection, Operations):
         before_time: str | None = None,
         after_time: str | None = None,
         progress: Progress | None = None,
-    ) -> dict[str, Any]:
+    ) -> Psf:
         """Interpolate between two fitted PSFs in time.
 
         Parameters
@@ -1018,9 +1058,9 @@ class Client(Connection, Operations):
             "after_time": after_time or self.psf(after)["valid_from"],
         }
         parameters = {"before_psf_id": before, "after_psf_id": after, "time": time, **without_none(times)}
-        return self.run("psf-interpolate", parameters, progress)
+        return cast("Psf", self.run("psf-interpolate", parameters, progress))
 
-    def contexts(self) -> Iterator[dict[str, Any]]:
+    def contexts(self) -> Iterator[ContextLine]:
         """List contexts, newest first.
 
         Returns
@@ -1028,9 +1068,9 @@ class Client(Connection, Operations):
         iterator of dict
             Their descriptions, without their pins.
         """
-        return self._all("/v1/contexts", {})
+        return self._all(ContextLine, "/v1/contexts", {})
 
-    def context(self, id_or_name: str) -> dict[str, Any]:
+    def context(self, id_or_name: str) -> Context:
         """Get a context with its pins.
 
         Parameters
@@ -1048,11 +1088,11 @@ class Client(Connection, Operations):
         ServiceError
             "no-such-context".
         """
-        return self.get(f"/v1/contexts/{id_or_name}")
+        return self._json(Context, "GET", f"/v1/contexts/{id_or_name}")
 
     def create_context(
-        self, name: str, pins: Sequence[dict[str, Any]] | None = None, *, reason: str = ""
-    ) -> dict[str, Any]:
+        self, name: str, pins: Sequence[Mapping[str, str | None]] | None = None, *, reason: str = ""
+    ) -> Context:
         """Create a context: PSFs that are pinned under a name.
 
         Parameters
@@ -1075,9 +1115,9 @@ class Client(Connection, Operations):
             "bad-name", "name-taken", "nothing-to-pin", "ranges-overlap", "no-line" or "no-such-psf".
         """
         body = {"name": name, "reason": reason, "pins": None if pins is None else list(pins)}
-        return self._json("POST", "/v1/contexts", json=body)
+        return self._json(Context, "POST", "/v1/contexts", json=body)
 
-    def default_context(self) -> dict[str, Any]:
+    def default_context(self) -> DefaultContext:
         """Get the context from which the PSF is chosen if a request names no context.
 
         Returns
@@ -1086,9 +1126,9 @@ class Client(Connection, Operations):
             ``context`` (None: the PSFs that are certified at the time of a request), and the ``history`` of its
             changes.
         """
-        return self.get("/v1/contexts/default")
+        return self._json(DefaultContext, "GET", "/v1/contexts/default")
 
-    def use_context(self, id_or_name: str | None, *, reason: str = "") -> dict[str, Any]:
+    def use_context(self, id_or_name: str | None, *, reason: str = "") -> DefaultContext:
         """Make a context the default.
 
         Parameters
@@ -1109,11 +1149,11 @@ class Client(Connection, Operations):
             "no-such-context".
         """
         body = {"context": id_or_name, "reason": reason}
-        return self._json("PUT", "/v1/contexts/default", json=body)
+        return self._json(DefaultContext, "PUT", "/v1/contexts/default", json=body)
 
     # Bulk runs ---------------------------------------------------------------------------------
 
-    def submit_bulk(self, **request: Any) -> dict[str, Any]:
+    def submit_bulk(self, **request: Any) -> Bulk:
         """Start a bulk run: many images, deconvolved in the same way.
 
         Parameters
@@ -1143,9 +1183,9 @@ class Client(Connection, Operations):
         ServiceError
             "no-such-image", "no-such-psf", "no-such-context", "bad-path" or "path-not-allowed".
         """
-        return self._json("POST", "/v1/bulk", json=_bulk_request(**request))
+        return self._json(Bulk, "POST", "/v1/bulk", json=_bulk_request(**request))
 
-    def estimate_bulk(self, *, sample: int | None = None, **request: Any) -> dict[str, Any]:
+    def estimate_bulk(self, *, sample: int | None = None, **request: Any) -> BulkEstimate:
         """Estimate a bulk run without starting it.
 
         Parameters
@@ -1171,9 +1211,9 @@ class Client(Connection, Operations):
             The errors of ``submit_bulk``.
         """
         body = _bulk_request(**request)
-        return self._json("POST", "/v1/bulk/estimate", json=body, params={"sample": sample})
+        return self._json(BulkEstimate, "POST", "/v1/bulk/estimate", json=body, params={"sample": sample})
 
-    def bulk(self, bulk_id: str) -> dict[str, Any]:
+    def bulk(self, bulk_id: str) -> Bulk:
         """Get the current description of a bulk run.
 
         Parameters
@@ -1191,9 +1231,9 @@ class Client(Connection, Operations):
         ServiceError
             "no-such-bulk".
         """
-        return self.get(f"/v1/bulk/{bulk_id}")
+        return self._json(Bulk, "GET", f"/v1/bulk/{bulk_id}")
 
-    def bulks(self, **filters: str) -> Iterator[dict[str, Any]]:
+    def bulks(self, **filters: str) -> Iterator[BulkLine]:
         """List bulk runs, newest first.
 
         Parameters
@@ -1206,9 +1246,9 @@ class Client(Connection, Operations):
         iterator of dict
             For each ``id``, ``name``, ``phase`` and the numbers of images, among others.
         """
-        return self._all("/v1/bulk", filters)
+        return self._all(BulkLine, "/v1/bulk", filters)
 
-    def pause_bulk(self, bulk_id: str) -> dict[str, Any]:
+    def pause_bulk(self, bulk_id: str) -> Bulk:
         """Pause a bulk run: it starts no more images.
 
         Parameters
@@ -1226,9 +1266,9 @@ class Client(Connection, Operations):
         ServiceError
             "no-such-bulk", or "wrong-phase" if it is not LISTING or RUNNING.
         """
-        return self._json("POST", f"/v1/bulk/{bulk_id}/pause")
+        return self._json(Bulk, "POST", f"/v1/bulk/{bulk_id}/pause")
 
-    def resume_bulk(self, bulk_id: str) -> dict[str, Any]:
+    def resume_bulk(self, bulk_id: str) -> Bulk:
         """Resume a paused or failed bulk run.
 
         Parameters
@@ -1246,9 +1286,9 @@ class Client(Connection, Operations):
         ServiceError
             "no-such-bulk", or "wrong-phase" if it is not PAUSED or ERROR.
         """
-        return self._json("POST", f"/v1/bulk/{bulk_id}/resume")
+        return self._json(Bulk, "POST", f"/v1/bulk/{bulk_id}/resume")
 
-    def cancel_bulk(self, bulk_id: str) -> dict[str, Any]:
+    def cancel_bulk(self, bulk_id: str) -> Bulk:
         """End a bulk run permanently. Products that are done are kept.
 
         Parameters
@@ -1266,9 +1306,9 @@ class Client(Connection, Operations):
         ServiceError
             "no-such-bulk", or "wrong-phase" if it has ended.
         """
-        return self._json("POST", f"/v1/bulk/{bulk_id}/cancel")
+        return self._json(Bulk, "POST", f"/v1/bulk/{bulk_id}/cancel")
 
-    def retry_bulk(self, bulk_id: str) -> dict[str, Any]:
+    def retry_bulk(self, bulk_id: str) -> Bulk:
         """Try the failed images of a bulk run again.
 
         Parameters
@@ -1287,7 +1327,7 @@ class Client(Connection, Operations):
             "no-such-bulk", "wrong-phase" if it was cancelled, or "equal-bulk-open" if another bulk run of the same
             request is open.
         """
-        return self._json("POST", f"/v1/bulk/{bulk_id}/retry")
+        return self._json(Bulk, "POST", f"/v1/bulk/{bulk_id}/retry")
 
     def delete_bulk(self, bulk_id: str) -> None:
         """Delete a bulk run that is not LISTING or RUNNING; its products are kept.
@@ -1304,7 +1344,7 @@ class Client(Connection, Operations):
         """
         self._answer("DELETE", f"/v1/bulk/{bulk_id}")
 
-    def bulk_failures(self, bulk_id: str) -> Iterator[dict[str, Any]]:
+    def bulk_failures(self, bulk_id: str) -> Iterator[BulkFailure]:
         """List the failed images of a bulk run.
 
         Parameters
@@ -1322,11 +1362,11 @@ class Client(Connection, Operations):
         ServiceError
             "no-such-bulk".
         """
-        return self._all(f"/v1/bulk/{bulk_id}/failures", {})
+        return self._all(BulkFailure, f"/v1/bulk/{bulk_id}/failures", {})
 
     def bulk_results(
         self, bulk_id: str, *, order: str = "bulk", limit: int | None = None
-    ) -> Iterator[dict[str, Any]]:
+    ) -> Iterator[BulkResult]:
         """List the images of a bulk run that are done.
 
         Parameters
@@ -1376,7 +1416,7 @@ class Client(Connection, Operations):
         """
         self.download(f"/v1/bulk/{bulk_id}/results?format={format}", path, overwrite=overwrite)
 
-    def wait_for_bulk(self, bulk_id: str, *, progress: Progress | None = None) -> dict[str, Any]:
+    def wait_for_bulk(self, bulk_id: str, *, progress: Progress | None = None) -> Bulk:
         """Wait until a bulk run ends, is paused or has failed.
 
         Parameters
@@ -1399,7 +1439,7 @@ class Client(Connection, Operations):
             Control-C was pressed; the bulk run continues.
         """
         try:
-            for bulk in self.follow(f"/v1/bulk/{bulk_id}"):
+            for bulk in cast("Iterator[Bulk]", self.follow(f"/v1/bulk/{bulk_id}")):
                 images = bulk["images"]
                 ended, total = images["done"] + images["failed"], images["total"]
                 if progress is not None and not bulk["listed"]:
@@ -1422,7 +1462,7 @@ class Client(Connection, Operations):
         label: str = "",
         lasts_days: float | None = None,
         owner: str | None = None,
-    ) -> dict[str, Any]:
+    ) -> MadeKey:
         """Make a key. Only this answer contains the whole key.
 
         Parameters
@@ -1447,9 +1487,9 @@ class Client(Connection, Operations):
             "keys-not-used", "scope-missing", "too-many-keys" or "outlives-its-maker".
         """
         body = {"scopes": list(scopes), "label": label, "lasts_days": lasts_days, "owner": owner}
-        return self._json("POST", "/v1/keys", json=body)
+        return self._json(MadeKey, "POST", "/v1/keys", json=body)
 
-    def keys(self, owner: str | None = None) -> Iterator[dict[str, Any]]:
+    def keys(self, owner: str | None = None) -> Iterator[Key]:
         """List keys without their secrets, newest first.
 
         Parameters
@@ -1467,9 +1507,9 @@ class Client(Connection, Operations):
         ServiceError
             "keys-not-used" or "scope-missing".
         """
-        return self._all("/v1/keys", {"owner": owner})
+        return self._all(Key, "/v1/keys", {"owner": owner})
 
-    def revoke_key(self, key_id: str, *, and_made: bool = False) -> dict[str, Any]:
+    def revoke_key(self, key_id: str, *, and_made: bool = False) -> Key:
         """Revoke a key.
 
         Parameters
@@ -1489,21 +1529,23 @@ class Client(Connection, Operations):
         ServiceError
             "no-such-key", "keys-not-used" or "scope-missing".
         """
-        return self._json("DELETE", f"/v1/keys/{key_id}", params={"and_made": and_made})
+        return self._json(Key, "DELETE", f"/v1/keys/{key_id}", params={"and_made": and_made})
 
 
 def _bulk_request(
     *,
     images: Sequence[str] = (),
-    files: Sequence[str | Mapping[str, Any]] = (),
+    files: Sequence[str | Mapping[str, object]] = (),
     output: str | None = None,
     only: bool = False,
     layout: str | None = None,
-    **fields: Any,
-) -> dict[str, Any]:
+    **fields: object,
+) -> dict[str, object]:
     """The body of a request for a bulk run, from the arguments of ``Client.submit_bulk``."""
     fields = without_none(fields)
-    own: dict[str, Any] = {name: fields.pop(name) for name in ("name", "psf_id", "context") if name in fields}
+    own: dict[str, object] = {
+        name: fields.pop(name) for name in ("name", "psf_id", "context") if name in fields
+    }
     return {
         **own,
         "images": list(images),

@@ -16,13 +16,14 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar, cast
 
 from psfcore.errors import DataError, HeaderError
 from psfcore.files import fits_in, sha256_of
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.cards import optional_text
 from psfcore.fits.header import all_hdus, read_first_image
+from service.client.answers import Product, Submitted
 from service.client.errors import Answer, Patience, ServiceError, WaitInterrupted
 from service.client.operations import Operations, deconvolution
 from service.client.outputs import check_output_folder, check_outputs
@@ -59,7 +60,7 @@ def deconvolve_many(
     *,
     overwrite: bool = False,
     progress: Callable[[int, int], None] = lambda done, of: None,
-    **parameters: Any,
+    **parameters: object,
 ) -> Iterator[Outcome]:
     """Deconvolve images into a folder, and yield the outcome for each image, in the order of the images.
 
@@ -91,8 +92,8 @@ class _Pending:
     image: Path
     key: tuple[str, str]
     output: Path
-    request: dict[str, Any]
-    job: dict[str, Any] | None
+    request: dict[str, object]
+    job: Submitted | None
 
 
 @dataclass
@@ -103,7 +104,7 @@ class _Run:
     images: Sequence[str | Path]
     folder: Path
     overwrite: bool
-    parameters: dict[str, Any]
+    parameters: dict[str, object]
     _products: _Products
     _pending: deque[_Pending | Outcome] = field(default_factory=deque)
 
@@ -125,7 +126,7 @@ class _Run:
                 raise
             raise WaitInterrupted("job", jobs[0], self.service.server, tuple(jobs[1:])) from stop
 
-    def _in_flight(self) -> list[dict[str, Any]]:
+    def _in_flight(self) -> list[Submitted]:
         return [one.job for one in self._pending if isinstance(one, _Pending) and one.job is not None]
 
     def _finished(self, leave: int) -> Iterator[Outcome]:
@@ -159,7 +160,7 @@ class _Run:
             pending.job = self._submit(pending)
         return pending
 
-    def _submit(self, pending: _Pending) -> dict[str, Any]:
+    def _submit(self, pending: _Pending) -> Submitted:
         inputs = self.images if pending.output.exists() else ()
         check_outputs((pending.output,), inputs=inputs, overwrite=self.overwrite)
         return _patiently(lambda: self.service.submit("deconvolve", **pending.request))
@@ -170,7 +171,7 @@ class _Run:
             return Outcome(pending.image, self._products[pending.key], existed=True)
         if pending.job is None:  # the earlier image failed
             pending.job = self._submit(pending)
-        product = self.service.get(self.service.wait(pending.job)["result"])
+        product = cast("Product", self.service.get(str(self.service.wait(pending.job)["result"])))
         self.service.download(product["file"], pending.output, overwrite=self.overwrite)
         self.service.release(product)
         self._products[pending.key] = pending.output

@@ -9,15 +9,17 @@ the new file is complete.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
+from service.client.answers import Ended, Job, Json, Product, Psf, Report, Submitted, Uploaded
 from service.client.errors import ServiceError
 from service.client.outputs import Name, check_outputs
 from workers.contract.requests import Deconvolve
 
 Progress = Callable[[str, int, int], None]  # called with the stage, the step, and the number of steps
+Value = TypeVar("Value")
 
 
 class Operations(ABC):
@@ -31,7 +33,7 @@ class Operations(ABC):
     jobs_at_once = 1  # in this process, a job runs when ``wait`` is called
 
     @abstractmethod
-    def upload_image(self, path: str | Path) -> dict[str, Any]:
+    def upload_image(self, path: str | Path) -> Uploaded:
         """Upload a FITS image.
 
         Parameters
@@ -51,7 +53,7 @@ class Operations(ABC):
         """
 
     @abstractmethod
-    def upload_transit(self, path: str | Path) -> dict[str, Any]:
+    def upload_transit(self, path: str | Path) -> Uploaded:
         """Upload a transit: a folder, or an archive of a folder. Returns the description of the transit, with its
         ``id``.
 
@@ -68,7 +70,7 @@ class Operations(ABC):
         instrument: str | None = None,
         channel: str | None = None,
         kind: str | None = None,
-    ) -> dict[str, Any]:
+    ) -> Uploaded:
         """Upload a PSF.
 
         Parameters
@@ -95,13 +97,13 @@ class Operations(ABC):
         """
 
     @abstractmethod
-    def submit(self, kind: str, **parameters: Any) -> dict[str, Any]:
+    def submit(self, kind: str, **parameters: Any) -> Submitted:
         """Submit a job; returns its description. If an identical job was submitted before, returns the description of
         that job.
         """
 
     @abstractmethod
-    def result_id(self, kind: str, **parameters: Any) -> str:
+    def result_id(self, kind: str, **parameters: object) -> str:
         """Get the id that the result of a job has or would have, without starting the job.
 
         Parameters
@@ -145,17 +147,17 @@ class Operations(ABC):
         """
 
     @abstractmethod
-    def release(self, product: dict[str, Any]) -> None:
+    def release(self, product: Uploaded) -> None:
         """Delete the files of a downloaded product if the service runs in this process; over HTTP, keep them."""
 
     @abstractmethod
-    def wait(self, job: dict[str, Any], *, progress: Progress | None = None) -> dict[str, Any]:
+    def wait(self, job: Submitted, *, progress: Progress | None = None) -> Ended:
         """Wait until a job is completed; returns its description. Raises ``ServiceError`` if the job fails or is
         cancelled.
         """
 
     @abstractmethod
-    def get(self, address: str) -> dict[str, Any]:
+    def get(self, address: str) -> dict[str, Json]:
         """The description at an address of the service, such as ``/v1/products/...``."""
 
     @abstractmethod
@@ -171,8 +173,8 @@ class Operations(ABC):
         changes: str | Path | None = None,
         progress: Progress | None = None,
         overwrite: bool = False,
-        **parameters: Any,
-    ) -> dict[str, Any]:
+        **parameters: object,
+    ) -> Product:
         """Upload an image, deconvolve it and download the product.
 
         Parameters
@@ -213,7 +215,7 @@ class Operations(ABC):
         image_id = self.upload_image(image)["id"]
         request = deconvolution(image_id, changes_picture=changes is not None, **parameters)
         files = {"file": output, "preview": preview, "changes": changes}
-        return self._download_result("deconvolve", request, files, progress, overwrite)
+        return cast("Product", self._download_result("deconvolve", request, files, progress, overwrite))
 
     def build_psf(
         self,
@@ -226,7 +228,7 @@ class Operations(ABC):
         preview: str | Path | None = None,
         progress: Progress | None = None,
         overwrite: bool = False,
-    ) -> dict[str, Any]:
+    ) -> Psf:
         """Build the PSF of an instrument and download it.
 
         Parameters
@@ -261,11 +263,11 @@ class Operations(ABC):
         named = named_instrument(instrument)
         file = instrument if "instrument_file" in named else None
         check_outputs((output, preview), inputs=(file, mask), overwrite=overwrite)
-        request: dict[str, Any] = {"size": size, "component": component, **named}
+        request: dict[str, object] = {"size": size, "component": component, **named}
         if mask is not None:
             request["mask_id"] = self.upload_image(mask)["id"]
         files = {"file": output, "preview": preview}
-        return self._download_result("psf-build", request, files, progress, overwrite)
+        return cast("Psf", self._download_result("psf-build", request, files, progress, overwrite))
 
     def psf_of_instrument(self, instrument: str) -> str:
         """Get the id of the PSF of an instrument, which is built if it does not exist.
@@ -295,7 +297,7 @@ class Operations(ABC):
         report: str | Path | None = None,
         preview: str | Path | None = None,
         **options: Any,
-    ) -> dict[str, Any]:
+    ) -> Psf:
         """Upload a transit, fit its scatter kernel and download the PSF.
 
         Parameters
@@ -326,7 +328,7 @@ class Operations(ABC):
             The errors of ``upload_transit`` and ``submit``, of the files as for ``deconvolve``, and of the fit.
         """
         files = {"file": output, "report": report, "preview": preview}
-        return self._on_transit("psf-fit", transit, files, **options)
+        return cast("Psf", self._on_transit("psf-fit", transit, files, **options))
 
     def cross_validate(
         self,
@@ -335,7 +337,7 @@ class Operations(ABC):
         *,
         preview: str | Path | None = None,
         **options: Any,
-    ) -> dict[str, Any]:
+    ) -> Report:
         """Upload a transit, cross-validate its fit and download the report.
 
         Parameters
@@ -362,7 +364,10 @@ class Operations(ABC):
         ServiceError
             As for ``fit_psf``.
         """
-        return self._on_transit("cross-validate", transit, {"file": report, "preview": preview}, **options)
+        return cast(
+            "Report",
+            self._on_transit("cross-validate", transit, {"file": report, "preview": preview}, **options),
+        )
 
     def report(
         self,
@@ -372,7 +377,7 @@ class Operations(ABC):
         page: str | Path | None = None,
         preview: str | Path | None = None,
         **options: Any,
-    ) -> dict[str, Any]:
+    ) -> Report:
         """Upload a transit, make a report on its PSF and download the report.
 
         Parameters
@@ -404,7 +409,7 @@ class Operations(ABC):
             As for ``fit_psf``.
         """
         files = {"file": report, "preview": preview, "html": page}
-        return self._on_transit("report", transit, files, **options)
+        return cast("Report", self._on_transit("report", transit, files, **options))
 
     def diagnose_gap(
         self,
@@ -414,7 +419,7 @@ class Operations(ABC):
         page: str | Path | None = None,
         preview: str | Path | None = None,
         **options: Any,
-    ) -> dict[str, Any]:
+    ) -> Report:
         """Upload a transit, diagnose the gap between it and the fitted model, download the report.
 
         Parameters
@@ -447,7 +452,7 @@ class Operations(ABC):
             As for ``fit_psf``.
         """
         files = {"file": report, "preview": preview, "html": page}
-        return self._on_transit("gap-diagnose", transit, files, **options)
+        return cast("Report", self._on_transit("gap-diagnose", transit, files, **options))
 
     def _on_transit(
         self,
@@ -458,8 +463,8 @@ class Operations(ABC):
         progress: Progress | None = None,
         noise: tuple[float, float] | None = None,
         overwrite: bool = False,
-        **parameters: Any,
-    ) -> dict[str, Any]:
+        **parameters: object,
+    ) -> dict[str, Json]:
         """Run a job of this kind on a transit, and download files of its result; returns the description of the
         result.
         """
@@ -471,11 +476,11 @@ class Operations(ABC):
     def _download_result(
         self,
         kind: str,
-        request: dict[str, Any],
+        request: dict[str, object],
         files: dict[str, Name | None],
         progress: Progress | None,
         overwrite: bool,
-    ) -> dict[str, Any]:
+    ) -> dict[str, Json]:
         """Run a job and download files of its result; returns the description of the result.
 
         files: the file to write, by the name of the address in the description.
@@ -483,10 +488,10 @@ class Operations(ABC):
         result = self.run(kind, request, progress)
         for name, path in files.items():
             if path is not None:
-                self.download(result[name], path, overwrite=overwrite)
+                self.download(str(result[name]), path, overwrite=overwrite)
         return result
 
-    def run(self, kind: str, parameters: dict[str, Any], progress: Progress | None) -> dict[str, Any]:
+    def run(self, kind: str, parameters: Mapping[str, object], progress: Progress | None) -> dict[str, Json]:
         """Run a job and wait for its result.
 
         Parameters
@@ -509,18 +514,18 @@ class Operations(ABC):
             The errors of ``submit`` and ``wait``.
         """
         job = self.submit(kind, **parameters)
-        return self.get(self.wait(job, progress=progress)["result"])
+        return self.get(str(self.wait(job, progress=progress)["result"]))
 
     @staticmethod
-    def _ended(job: dict[str, Any]) -> dict[str, Any]:
+    def _ended(job: Job) -> Job:
         """The job, if it is completed. Raises ``ServiceError`` if it failed, was cancelled or was never started."""
         if job["phase"] == "PENDING":
             raise ServiceError(
                 f"job {job['id']} was created but not started: start it with PHASE=RUN at /uws/jobs/{job['id']}/phase",
                 code="pending",
             )
-        if job["phase"] == "ERROR":
-            raise ServiceError(job["error"]["message"], code=job["error"]["code"])
+        if job["phase"] == "ERROR" and (fault := job["error"]) is not None:
+            raise ServiceError(fault["message"], code=fault["code"])
         if job["phase"] == "ABORTED":
             raise ServiceError(
                 f"job {job['id']} was cancelled: submit it again if you need its result", code="cancelled"
@@ -528,14 +533,14 @@ class Operations(ABC):
         return job
 
 
-def deconvolution(image_id: str, **parameters: Any) -> dict[str, Any]:
+def deconvolution(image_id: str, **parameters: object) -> dict[str, object]:
     """The parameters of a request to deconvolve an uploaded image, from the arguments of ``Operations.deconvolve``."""
     return {"image_id": image_id, **treatment(**parameters)}
 
 
 def treatment(
-    *, method: str = "richardson-lucy", noise: tuple[float, float] | None = None, **parameters: Any
-) -> dict[str, Any]:
+    *, method: object = "richardson-lucy", noise: object = None, **parameters: object
+) -> dict[str, object]:
     """The fields of a request to deconvolve, from the arguments of ``Operations.deconvolve``."""
     parameters = without_none(parameters)
     fields = {name: value for name, value in parameters.items() if name in Deconvolve.model_fields}
@@ -550,11 +555,14 @@ def named_instrument(instrument: str | Path) -> dict[str, str]:
     return {"instrument": instrument}
 
 
-def without_none(parameters: dict[str, Any]) -> dict[str, Any]:
+def without_none(parameters: Mapping[str, Value]) -> dict[str, Value]:
     """The parameters that are not None. The service has defaults for the others."""
     return {name: value for name, value in parameters.items() if value is not None}
 
 
-def _noise(noise: tuple[float, float] | None) -> dict[str, Any]:
+def _noise(noise: object) -> dict[str, object]:
     """The parameter of a job for photon gain (DN per photon) and read noise (DN rms), if given."""
-    return {} if not noise else {"noise": {"photon_gain_dn": noise[0], "read_noise_dn": noise[1]}}
+    if not noise:
+        return {}
+    gain, read = cast("tuple[float, float]", noise)
+    return {"noise": {"photon_gain_dn": gain, "read_noise_dn": read}}

@@ -7,7 +7,7 @@ answers.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -32,6 +32,7 @@ from workers.machine import psf_cache, published_folder
 
 if TYPE_CHECKING:
     from psfcore.psf import Psf
+    from service.client.answers import AnnulusAnswer, ComparisonAnswer, CurveAnswer, ProfileAnswer
 _MIB = 2**20
 PSF = click.argument("psf", type=ID_OR_FILE, metavar="ID|FILE")
 SHOWN_RADII_PX = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
@@ -114,7 +115,7 @@ def query(
     overwrite: bool,
 ) -> None:
     """Show the light of a PSF beyond radii or in an annulus, and the difference from another PSF."""
-    answers: dict[str, Any] = {}
+    answers: dict[str, object] = {}
     with _asking(psf, compare) as ask:
         if radii or not (annulus or profile or compare):
             reach_px = ask["encircled"](radius=0.0)["reach_px"]
@@ -199,17 +200,17 @@ def clear() -> None:
     echo(f"removed {count} PSFs, {removed / _MIB:.1f} MiB, from {folder.folder}")
 
 
-def _named(provenance: dict[str, Any]) -> str:
+def _named(provenance: Mapping[str, Any]) -> str:
     """The instrument, the size and the component of a PSF, from its provenance."""
     if not provenance:
         return "(incomplete)"
-    parameters: dict[str, Any] = provenance["parameters"]
+    parameters = provenance["parameters"]
     parts = [parameters.get("instrument", "your instrument file"), f"{parameters['size']} px"]
     return ", ".join([*parts, *filter(None, [parameters.get("component")])])
 
 
 @contextmanager
-def _asking(psf: str, other: str | None) -> Iterator[dict[str, Callable[..., dict[str, Any]]]]:
+def _asking(psf: str, other: str | None) -> Iterator[dict[str, Callable[..., Any]]]:
     """The functions that answer questions about a PSF, and compare it with another one: the service answers for ids;
     for files the tables are computed here.
     """
@@ -250,7 +251,7 @@ def _write(output: Path, psf: Psf, overwrite: bool) -> None:
         write_psf(partial, psf, instrument_file=None if text is None else text.encode())
 
 
-def _curve_lines(answer: dict[str, Any]) -> list[str]:
+def _curve_lines(answer: CurveAnswer) -> list[str]:
     shape, sigma = answer["shape"], answer["sigma_points"]
     return [
         f"{answer['name']} {answer['version']}, sum {answer['sum_on_array']:.6f} on {shape[1]} x {shape[0]} px, "
@@ -270,7 +271,7 @@ def _curve_lines(answer: dict[str, Any]) -> list[str]:
     ]
 
 
-def _annulus_lines(answer: dict[str, Any]) -> list[str]:
+def _annulus_lines(answer: AnnulusAnswer) -> list[str]:
     lines = [f"light between {answer['inner_px']:g} and {answer['outer_px']:g} px, in percent of all light:"]
     for name, light in answer["light"].items():
         sigma = answer["sigma"].get(name)
@@ -278,14 +279,14 @@ def _annulus_lines(answer: dict[str, Any]) -> list[str]:
     return [*lines, f"({answer['resolution']})"]
 
 
-def _profile_lines(answer: dict[str, Any]) -> list[str]:
+def _profile_lines(answer: ProfileAnswer) -> list[str]:
     radii = answer["radius_px"]
     shown = [n for n, radius in enumerate(radii) if radius <= 20 or radius % 10 == 0]
     columns = {name: [f"{row[n]:.4e}" for n in shown] for name, row in answer["mean_weight"].items()}
     return ["mean weight of a pixel:", *_table([f"{radii[n]:g}" for n in shown], columns)]
 
 
-def _compare_lines(answer: dict[str, Any]) -> list[str]:
+def _compare_lines(answer: ComparisonAnswer) -> list[str]:
     one, other, radii = answer["one"], answer["other"], answer["radii_px"]
     shown = [n for n, radius in enumerate(radii) if radius in (0.0, *SHOWN_RADII_PX)]
     columns = {
@@ -314,7 +315,7 @@ def _with_sigma(value: float, sigma: float | None) -> str:
     return f"{value:.3f}" if sigma is None else f"{value:.3f} ± {sigma:.3f}"
 
 
-_LINES = {
+_LINES: dict[str, Callable[[Any], list[str]]] = {
     "curve": _curve_lines,
     "annulus": _annulus_lines,
     "profile": _profile_lines,

@@ -5,16 +5,15 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypedDict, cast
 
 import click
 
 from service.cli.connection import (
     CONTEXT,
     ID,
-    Row,
     id_argument,
     on_service,
     print_rows,
@@ -38,7 +37,17 @@ from service.client.operations import without_none
 from workers.versions import TOTAL, PsfStatus
 
 if TYPE_CHECKING:
+    from service.client.answers import Ancestor, Choice, ChosenPsf, ContextLine, Pin, Psf
+    from service.client.answers import PsfStatus as Status
     from service.client.http import Client
+
+
+class Reasoned(TypedDict):
+    """The PSF that a deconvolution of an image would use, and why."""
+
+    psf: Psf | ChosenPsf
+    why: str
+
 
 PSF_ID = id_argument("psf_id")
 REASON = click.option("--reason", default="", show_default=False, help="Reason, kept in the history")
@@ -74,14 +83,14 @@ def _filter_options(command: Command) -> Command:
 @click.command("list")
 @_filter_options
 @on_service
-def list_psfs(service: Client, **filters: Any) -> None:
+def list_psfs(service: Client, **options: str | None) -> None:
     """List the PSFs of a service."""
-    filters = without_none(filters)
+    filters = {name: value for name, value in options.items() if value is not None}
     none = "no PSF with " + ", ".join(f"{name} {value}" for name, value in filters.items())
     if not filters:
         none = "no PSF yet; `heliopsf psf build` or the first deconvolution makes a PSF"
 
-    def line(row: Row) -> str:
+    def line(row: Psf) -> str:
         return (
             f"{_named(row)}  {row['status']}  {'x'.join(map(str, row['details']['shape']))}{_validity(row)}"
         )
@@ -207,16 +216,16 @@ def best(
             "--image can only be combined with --context and --kind; leave out the other filters"
         )
     if image is None:
-        choice = service.best_psf(**filters)
+        choice: Choice | Reasoned = service.best_psf(**filters)
     elif filters.get("kind", TOTAL) == TOTAL:
         choice = _choice(service, image, filters.get("context"))
     else:
         choice = service.psf_for_image(service.upload_image(image)["id"], **filters)
-    psf = choice["psf"]
+    psf = cast("Psf", choice["psf"])  # the entry of an estimate has neither status nor range
     status = "not built yet" if psf["status"] is None else f"{psf['status']}{_validity(psf)}"
     echo(f"{_named(psf)}  {status}")
-    if "why" in choice:
-        echo(f"  {choice['why']}")
+    if why := choice.get("why"):
+        echo(f"  {why}")
     write_json(json_file, choice, overwrite=overwrite)
 
 
@@ -354,7 +363,7 @@ def list_contexts(service: Client) -> None:
     """List contexts. A * marks the default context."""
     default = service.default_context()["context"]
 
-    def line(row: Row) -> str:
+    def line(row: ContextLine) -> str:
         sign = "*" if default is not None and default["id"] == row["id"] else " "
         return f"{sign} {short(row['id'])}  {row['name']}  {row['size']} pinned  {row['reason']}"
 
@@ -392,18 +401,19 @@ def use(service: Client, name: str | None, no_context: bool, reason: str) -> Non
     )
 
 
-def _choice(service: Client, image: Path, context: str | None) -> Row:
+def _choice(service: Client, image: Path, context: str | None) -> Reasoned:
     """The PSF that a deconvolution of an image would use, and why. If the PSF is not built yet, only its entry in the
     estimate is known.
     """
     image_id = service.upload_image(image)["id"]
-    choice: Row = service.estimate("deconvolve", image_id=image_id, context=context)["psf"]
+    choice = service.estimate("deconvolve", image_id=image_id, context=context)["psf"]
+    assert choice is not None  # of a job that deconvolves
     return {"psf": choice if choice["status"] is None else service.psf(choice["id"]), "why": choice["why"]}
 
 
-def _limit(service: Client, psf_id: str, name: str, option: str) -> str:
+def _limit(service: Client, psf_id: str, name: Literal["valid_from", "valid_to"], option: str) -> str:
     """The end or the start of the range for which a PSF is certified."""
-    at: str | None = service.psf(psf_id)[name]
+    at = service.psf(psf_id)[name]
     if at is None:
         raise click.UsageError(
             f"expected {option}, because PSF {short(psf_id)} has no {'end' if name == 'valid_to' else 'start'} of a "
@@ -412,26 +422,26 @@ def _limit(service: Client, psf_id: str, name: str, option: str) -> str:
     return at
 
 
-def _named(psf: Row) -> str:
+def _named(psf: Psf) -> str:
     """The short id, the name and the version of a PSF."""
     return f"{short(psf['id'])}  {psf['name']}  {psf['version']}"
 
 
-def _validity(row: Row) -> str:
+def _validity(row: Psf | Status) -> str:
     """The time range of a PSF; empty if the PSF was never certified."""
     return f"  {_range(row)}" if row["was_certified"] else ""
 
 
-def _range(row: Row) -> str:
+def _range(row: Psf | Status | Pin) -> str:
     return f"[{row['valid_from'] or 'always'}, {row['valid_to'] or 'open'})"
 
 
-def _tree(entry: Row, depth: int) -> Iterator[str]:
+def _tree(entry: Ancestor, depth: int) -> Iterator[str]:
     """A lineage as lines. The inputs of an entry follow it on indented lines."""
-    details = entry["made"] or {}
+    details: Mapping[str, object] = entry["made"] or {}
     name = " ".join(str(details[key]) for key in ("name", "version", "status") if details.get(key))
     by = [f"heliopsf {details['software_version']}"] if details.get("software_version") else []
-    by += [f"job {short(details['job_id'])}"] if details.get("job_id") else []
+    by += [f"job {short(str(details['job_id']))}"] if details.get("job_id") else []
     share = f"weight {entry['weight']:.3f}" if entry.get("weight") is not None else ""
     gone = "" if entry["there"] or entry["type"] == "instrument-file" else "deleted since"
     cut = "shown above" if entry["cut"] else ""
