@@ -178,7 +178,7 @@ class GapDiagnosis(diagnose.Diagnosis):
         dict
             Verdict, probabilities, limits and cautions, as JSON values (docs/gap.md).
         """
-        return gap_report(self)
+        return dict(gap_report(self))
 
     def plot(self, axes: Axes | None = None) -> Axes:
         """Draw the probabilities of the effects.

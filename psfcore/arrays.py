@@ -22,7 +22,7 @@ import hashlib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,12 +32,13 @@ Matrix = NDArray[np.float64]  # (rows, columns), or more axes
 Plane = NDArray[np.float64]  # [y, x] of an image
 Kernel = NDArray[np.float64]  # weights [y, x] of a PSF, with the centre at [ny // 2, nx // 2]
 Flags = NDArray[np.bool_]
+Number = TypeVar("Number", bound=np.generic)
 
 # Share of B's largest eigenvalue: a direction whose eigenvalue is smaller is undetermined.
 WEAKEST_DIRECTION = 1e-15
 
 
-def json_values(value: Any) -> Any:
+def json_values(value: object) -> Any:
     """The JSON values of a result.
 
     Arrays become lists, mappings and dataclasses become objects, and nan and infinity become null, because JSON cannot
@@ -54,7 +55,7 @@ def json_values(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def json_attributes(of: object, *names: str) -> dict[str, Any]:
+def json_attributes(of: object, *names: str) -> dict[str, object]:
     """The JSON values of some attributes of an object, by name."""
     return {name: json_values(getattr(of, name)) for name in names}
 
@@ -103,7 +104,7 @@ def array_sha256(array: NDArray[np.generic]) -> str:
     return hashlib.sha256(plain.tobytes()).hexdigest()
 
 
-def squares(planes: NDArray[Any], edge: int) -> NDArray[Any]:
+def squares(planes: NDArray[Number], edge: int) -> NDArray[Number]:
     """Planes [..., y, x], divided into squares of `edge` px: (..., rows, edge, columns, edge).
 
     Incomplete squares in the last rows and columns are left out.
@@ -113,7 +114,7 @@ def squares(planes: NDArray[Any], edge: int) -> NDArray[Any]:
     return cut.reshape(*planes.shape[:-2], rows, edge, columns, edge)
 
 
-def cut(plane: Any, top: int, left: int, size: tuple[int, int]) -> Any:
+def cut(plane: NDArray[Number], top: int, left: int, size: tuple[int, int]) -> NDArray[Number]:
     """A window of a plane [y, x]; its pixels outside the plane are 0."""
     out = np.zeros(size, plane.dtype)
     low_y, high_y = (min(max(at, 0), plane.shape[0]) for at in (top, top + size[0]))

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,10 +77,11 @@ def build_psf(
         threads=threads,
         progress=None if progress is None else lambda done, of: progress(900 * done // of, 1000),
     )
-    provenance = _provenance(instrument, patterns.notes)
+    past_reach: dict[str, float] = {}
+    provenance = _provenance(instrument, patterns.notes, past_reach)
     kernels: dict[str, Kernel] = {}
     for name in (name for name in names if name in patterns.kernels):
-        kernels[name], provenance["past_reach"][name.lower()] = _on_full_reach(patterns.kernels.pop(name))
+        kernels[name], past_reach[name.lower()] = _on_full_reach(patterns.kernels.pop(name))
     del patterns
     law = instrument.scatter
     if law is not None and SCATTER in names:
@@ -93,7 +93,7 @@ def build_psf(
         kernel = kernels[DIFFRACTION]
     else:
         total = linear_convolve(kernels[SCATTER], kernels[DIFFRACTION], (grid, grid), threads=threads)
-        kernel, provenance["past_reach"]["total"] = _on_full_reach(total)
+        kernel, past_reach["total"] = _on_full_reach(total)
     if progress is not None:
         progress(1000, 1000)
     shape = (size, size)
@@ -156,17 +156,19 @@ def _on_full_reach(kernel: Kernel) -> tuple[Kernel, float]:
     return positive / inner, 1 - inner
 
 
-def _provenance(instrument: Instrument, notes: dict[str, Any]) -> dict[str, Any]:
+def _provenance(
+    instrument: Instrument, notes: dict[str, object], past_reach: dict[str, float]
+) -> dict[str, object]:
     law, mount = instrument.scatter, instrument.mount
     model = "simplified-combined: entrance pupil convolved with filter-wheel mesh series"
     shape = "a softened power law"
     if law is not None and law.b_px is None:
         shape = f"{len(law.laws)} power laws" if law.laws else f"a table of {len(law.table)} radii"
-    about: dict[str, Any] = {
+    about: dict[str, object] = {
         "model": model if law is None else f"{model}, and with {shape}",
         "mount_basis": "none" if mount is None else mount.basis,
         "lines": [[line.wavelength_angstrom, line.weight] for line in instrument.spectral_lines],
-        "past_reach": {},
+        "past_reach": past_reach,
         **notes,
     }
     if any(mesh.basis == "assumed" for mesh in instrument.meshes):

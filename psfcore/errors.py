@@ -24,17 +24,17 @@ class DataError(ValueError):
         A stable word in kebab-case for programs, such as "all-nan".
     message : str
         A sentence for people: what was expected, what was found, and what to do next.
-    fields : mapping of str to Any, optional
+    fields : mapping of str to object, optional
         Further facts for programs, as JSON values.
     """
 
-    def __init__(self, code: str, message: str, fields: Mapping[str, Any] | None = None) -> None:
+    def __init__(self, code: str, message: str, fields: Mapping[str, object] | None = None) -> None:
         super().__init__(f"{code}: {message}")
         self.code = code
         self.message = message
         self.fields = dict(fields or {})
 
-    def __reduce__(self) -> tuple[type[DataError], tuple[str, str, dict[str, Any]]]:
+    def __reduce__(self) -> tuple[type[DataError], tuple[str, str, dict[str, object]]]:
         return type(self), (self.code, self.message, self.fields)
 
 

@@ -29,6 +29,7 @@ from psfcore.fits.blocks import BLOCK_BYTES
 from psfcore.recipe import Recipe
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
 
     from psfcore.fits.blocks import FitsLimits
@@ -182,7 +183,7 @@ def built_file(
     recipe: Recipe,
     *,
     parts: bool = True,
-    mount_image: NDArray[Any] | None = None,
+    mount_image: NDArray[np.floating] | None = None,
     threads: int,
     progress: Callable[[int, int], None] | None = None,
 ) -> Iterator[tuple[Path, dict[str, Any]]]:

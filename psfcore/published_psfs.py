@@ -20,7 +20,7 @@ from importlib.resources import files
 from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 from urllib.parse import urljoin, urlsplit
 
 from psfcore.errors import DataError, did_you_mean, module_of_extra
@@ -278,7 +278,7 @@ def _as_psf(one: Published, file: Path, sha256: str) -> Psf:
 
     kernel = read_plane(file, LIMITS)
     total = float(kernel.sum())
-    provenance: dict[str, Any] = {"doi": one.doi, "citation": one.citation, "contains": one.contains}
+    provenance: dict[str, object] = {"doi": one.doi, "citation": one.citation, "contains": one.contains}
     provenance |= {"published_file": one.file, "published_sha256": sha256}
     if total > LARGEST_SUM:
         kernel /= total

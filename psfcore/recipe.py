@@ -10,7 +10,6 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 REACH_GRID_PX = 2048  # light is counted over this grid: the full reach
 BUILD_VERSION = 3  # raise this number when a change of the code changes the PSF of a recipe
@@ -56,7 +55,7 @@ class Recipe:
         )
 
     @property
-    def parameters(self) -> dict[str, Any]:
+    def parameters(self) -> dict[str, object]:
         """The parameters that are set, as the provenance of the PSF records them."""
         every = {
             "instrument": self.name,

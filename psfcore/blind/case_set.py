@@ -98,7 +98,7 @@ class BlindSet:
                 )
         return found
 
-    def keep_truth(self, number: int, truth: dict[str, Any]) -> str:
+    def keep_truth(self, number: int, truth: dict[str, object]) -> str:
         """Write the truth of a case with a random salt. Returns its seal."""
         salt = secrets.token_hex(16)
         write_whole(self.truth_file(number), json.dumps({"salt": salt, "truth": truth}, allow_nan=False))
@@ -252,7 +252,7 @@ def alone_in(folder: Path) -> Iterator[None]:
         yield
 
 
-def _seal_of(salt: str, truth: dict[str, Any]) -> str:
+def _seal_of(salt: str, truth: dict[str, object]) -> str:
     """SHA-256 (hex) of a salt and the canonical JSON of a truth."""
     canonical = json.dumps(truth, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256((salt + canonical).encode()).hexdigest()

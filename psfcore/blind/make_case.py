@@ -11,7 +11,6 @@ import dataclasses
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +32,7 @@ STRENGTH_WITHIN = 1.4  # a strength is accepted if its residual is within this f
 MAP_POINTS = 64  # number of points of a map along each axis
 
 
-def make(case: Case, transit: Path, expected: Path, images: Sequence[Plane] = ()) -> dict[str, Any]:
+def make(case: Case, transit: Path, expected: Path, images: Sequence[Plane] = ()) -> dict[str, object]:
     """Make the scenes, set the strengths, simulate the exposures, and measure what the effects leave. Returns the
     truth.
 
@@ -51,7 +50,7 @@ def make(case: Case, transit: Path, expected: Path, images: Sequence[Plane] = ()
     whole = clean.with_effects(*(one.effects[0] for one, _ in alone))
     places = reported_places(plan, case.seed)
 
-    def write(folder: Path, exposures: Sequence[NDArray[Any]], level: float | None) -> None:
+    def write(folder: Path, exposures: Sequence[NDArray[np.generic]], level: float | None) -> None:
         own = dataclasses.replace(plan, saturation_dn=level)
         write_observation(folder, own, exposures, places, diffraction)
 
@@ -94,7 +93,7 @@ def make(case: Case, transit: Path, expected: Path, images: Sequence[Plane] = ()
     }
 
 
-def _effect(simulation: Simulation, left_pct: float, clean: Simulation) -> dict[str, Any]:
+def _effect(simulation: Simulation, left_pct: float, clean: Simulation) -> dict[str, object]:
     """The entry of an effect in the truth. simulation: the case with this effect alone."""
     (effect,) = simulation.effects
     entry = effect.as_json() | {"left_alone_pct": left_pct}

@@ -21,7 +21,6 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 from psfcore.blind.case_set import BlindSet, Progress
 from psfcore.errors import DataError
@@ -106,7 +105,7 @@ def run_of(blind_set: BlindSet, number: int) -> Run | None:
     return Run(**json.loads(file.read_text("utf-8"))) if file.is_file() else None
 
 
-def result_in(file: Path, schema: str) -> dict[str, Any] | None:
+def result_in(file: Path, schema: str) -> dict[str, object] | None:
     """The complete result of this schema in a file; None if there is none. schema: REPORT_SCHEMA or BOUND_SCHEMA."""
     try:
         found = json.loads(file.read_text("utf-8"))

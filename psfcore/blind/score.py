@@ -148,7 +148,7 @@ def _over_bound(figure: str, causes: Sequence[Cause], level: str, least: float) 
     return row(figure, _right(causes, level), least, expected=_bounds(causes, level))
 
 
-def score(cases: Sequence[DiagnosedCase], failures: Mapping[int, str]) -> dict[str, Any]:
+def score(cases: Sequence[DiagnosedCase], failures: Mapping[int, str]) -> dict[str, object]:
     """The score of the cases that have a report, as JSON (gap-blind/3).
 
     failures: the reasons why the other cases have no report, by number.

@@ -132,7 +132,7 @@ class Simulation:
         return out
 
 
-def focal_planes(clean: EffectFree, effects: Sequence[Effect]) -> Iterator[Plane]:
+def focal_planes(clean: EffectFree, effects: Sequence[Effect]) -> Iterator[NDArray[np.floating]]:
     """The light of every image in the focal plane, on fine pixels [y, x], DN/s, with effects of the steps up to it."""
     varies = any(effect.kind.varies for effect in effects)
     for index in range(len(clean.plan.shots)):

@@ -25,13 +25,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion, uniform_filter
 from scipy.special import ndtri
 
+from psfcore.arrays import Flags
 from psfcore.deconvolve.assess.artefacts import classes_of, filled, second_differences
 from psfcore.errors import DataError
 from psfcore.fits.cards import optional_text
@@ -78,7 +79,7 @@ class CameraNoise(Noise):
             texts = [f"{value:.3g} +- {error:.1g}" for value, error in zip(figures, self.sigma, strict=True)]
         return f"photon gain {texts[0]} DN, read noise {texts[1]} DN, {self.source} ({self.basis})"
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, object]:
         """The figures and their source."""
         figures = {"photon_gain_dn": self.photon_gain_dn, "read_noise_dn": self.read_noise_dn}
         return {**figures, "source": self.source, "sigma": self.sigma, "text": str(self)}
@@ -120,11 +121,11 @@ def measured_noise(image: Image, sigma: Plane | None = None) -> CameraNoise:
     rows = blocks % -(-image.pixels.size // _MOST_PIXELS) == 0
     # A second difference needs all nine pixels.
     counted = binary_erosion(image.valid[rows], np.ones((3, 3), dtype=np.bool_), border_value=True)
-    planes = [filled(image.pixels[rows]), counted, None if sigma is None else sigma[rows]]
+    pixels, errors = filled(image.pixels[rows]), None if sigma is None else sigma[rows]
     ny, nx = (side // 2 for side in counted.shape)
     quarters = (np.s_[:ny, :nx], np.s_[:ny, nx:], np.s_[ny:, :nx], np.s_[ny:, nx:])
     whole, *parts = (
-        _transfer(*(None if plane is None else plane[box] for plane in planes))
+        _transfer(pixels[box], counted[box], None if errors is None else errors[box])
         for box in (np.s_[:, :], *quarters)
     )
     if whole is None or not any(whole):
@@ -149,7 +150,7 @@ def _mean_of_lowest(values: Plane) -> float:
     return float(np.partition(values, count - 1)[:count].mean())
 
 
-def _transfer(pixels: Any, counted: Any, sigma: Any) -> tuple[float, float] | None:
+def _transfer(pixels: Plane, counted: Flags, sigma: Plane | None) -> tuple[float, float] | None:
     """G and r of Eq. (1) in the unit of the pixels; None for too few pixels."""
     classes = classes_of(uniform_filter(pixels, 3)[counted])
     if not classes.centres.size:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from astropy.io.fits import Header
@@ -131,15 +131,15 @@ class Product(Deconvolved):
         return f"{self.name}   PSF {psf.name} {psf.version}"
 
     def details(
-        self, used: UsedPsf | None = None, provenance: Mapping[str, Any] | None = None
-    ) -> dict[str, Any]:
+        self, used: UsedPsf | None = None, provenance: Mapping[str, object] | None = None
+    ) -> dict[str, object]:
         """Describe how the image was deconvolved, and what changed.
 
         Parameters
         ----------
         used : UsedPsf, optional
             The PSF as the cards of the result name it. Default: as its file names it.
-        provenance : mapping of str to Any, optional
+        provenance : mapping of str to object, optional
             How the PSF was made. Default: as its file says.
 
         Returns
@@ -258,7 +258,7 @@ class PsfSource:
     other_channel: bool = False
     seen_as: Callable[[Psf], Psf] = lambda psf: psf
     used: UsedPsf | None = None
-    provenance: Mapping[str, Any] | None = None
+    provenance: Mapping[str, object] | None = None
     warnings: Mapping[str, str] = field(default_factory=dict)
 
     def on_pixels_of(self, header: Header, load: Callable[[], Psf]) -> tuple[Psf, Psf, str | None]:

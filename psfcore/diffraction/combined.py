@@ -23,7 +23,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,7 +72,7 @@ class Patterns:
     """The pattern of each component (the share of all light in each pixel), and notes on how it was computed."""
 
     kernels: dict[str, Kernel] = field(default_factory=dict)
-    notes: dict[str, Any] = field(default_factory=dict)
+    notes: dict[str, object] = field(default_factory=dict)
 
 
 def route_of(instrument: Instrument) -> Route:
@@ -177,7 +176,7 @@ class _OneWavelength:
     size: int
     mount_image: NDArray[np.floating] | None
     threads: int
-    notes: dict[str, Any]
+    notes: dict[str, object]
     kernels: dict[str, Kernel] = field(default_factory=dict)
 
     def kernel(self, name: str, progress: Progress) -> Kernel:
@@ -209,18 +208,23 @@ class _OneWavelength:
         aperture = self.instrument.aperture
         if self.route.mask and not aperture.round:
             return self._far_field(AIRY, (), None, progress)
-        optics: dict[str, Any] = {
-            "wavelength_angstrom": self.wavelength_angstrom,
-            "focal_length_mm": self.instrument.focal_length_mm,
-            "pixel_pitch_um": self.instrument.detector.pixel_pitch_um,
-            "size": self.size,
-        }
+        wavelength_angstrom, focal_length_mm = self.wavelength_angstrom, self.instrument.focal_length_mm
+        pixel_pitch_um = self.instrument.detector.pixel_pitch_um
         if not aperture.round:
-            return edge_kernel(aperture, **optics)
+            return edge_kernel(
+                aperture,
+                wavelength_angstrom=wavelength_angstrom,
+                focal_length_mm=focal_length_mm,
+                pixel_pitch_um=pixel_pitch_um,
+                size=self.size,
+            )
         return airy_kernel(
             diameter_mm=aperture.diameter_mm,
             obscuration_diameter_mm=aperture.obscuration_diameter_mm,
-            **optics,
+            wavelength_angstrom=wavelength_angstrom,
+            focal_length_mm=focal_length_mm,
+            pixel_pitch_um=pixel_pitch_um,
+            size=self.size,
         )
 
     def _far_field(
@@ -272,17 +276,21 @@ class _OneWavelength:
             pitch_um=mesh.pitch_um,
             pixel_pitch_um=self.instrument.detector.pixel_pitch_um,
         )
-        series: dict[str, Any] = {
-            "pitch_um": mesh.pitch_um,
-            "wire_um": mesh.wire_um,
-            "windows": windows_of(mesh),
-            "size": self.size,
-        }
+        windows = windows_of(mesh)
         if mesh.openings == "square" and mesh.angle_deg % 90 == 0:
-            line = mesh_line(spacing_px, **series)
+            line = mesh_line(
+                spacing_px, pitch_um=mesh.pitch_um, wire_um=mesh.wire_um, windows=windows, size=self.size
+            )
             return np.outer(line, line)
         kernel = rotated_mesh_kernel if mesh.openings == "square" else hexagonal_mesh_kernel
-        return kernel(spacing_px, angle_deg=mesh.angle_deg, **series)
+        return kernel(
+            spacing_px,
+            angle_deg=mesh.angle_deg,
+            pitch_um=mesh.pitch_um,
+            wire_um=mesh.wire_um,
+            windows=windows,
+            size=self.size,
+        )
 
     def _convolved(self, a: Kernel, b: Kernel) -> Kernel:
         return linear_convolve(a, b, (self.size, self.size), threads=self.threads)

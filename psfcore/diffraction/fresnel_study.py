@@ -27,7 +27,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,7 +133,7 @@ class FresnelStudy:
     radii_px: Vector
     distances: tuple[DistanceResult, ...]
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, object]:
         """The study as JSON values.
 
         Curves are given at every radius up to ZOOM_PX and in growing steps beyond; lines are given up to ZOOM_PX. The
@@ -320,7 +319,7 @@ def _check(path: LightPath, distances_mm: Sequence[float], phases: int, windows:
             raise DataError(code, f"expected 1 to {most} {code.removeprefix('bad-')}; got {value}")
 
 
-def _distance_json(result: DistanceResult, kept: NDArray[np.int64]) -> dict[str, Any]:
+def _distance_json(result: DistanceResult, kept: NDArray[np.int64]) -> dict[str, object]:
     near = slice(REACH_PX - ZOOM_PX, REACH_PX + ZOOM_PX + 1)
     lines = ("fresnel_line", "combined_line")
     curves = (

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
@@ -55,7 +55,7 @@ def fresnel_png(study: FresnelStudy, path: str | Path) -> None:
     write_png(figure, path)
 
 
-def _draw_centre(axes: Any, shown: DistanceResult, centre: int) -> None:
+def _draw_centre(axes: Axes, shown: DistanceResult, centre: int) -> None:
     offsets = np.arange(-SHOWN_PX, SHOWN_PX + 1)
     near = slice(centre - SHOWN_PX, centre + SHOWN_PX + 1)
     # Where the two curves agree, the wider curve is visible on both sides of the thinner curve.
@@ -68,7 +68,7 @@ def _draw_centre(axes: Any, shown: DistanceResult, centre: int) -> None:
     axes.legend(frameon=False, loc="upper right")
 
 
-def _draw_curves(axes: Any, shown: DistanceResult, study: FresnelStudy) -> None:
+def _draw_curves(axes: Axes, shown: DistanceResult, study: FresnelStudy) -> None:
     # The central pixel, radius 0, is drawn at half a pixel, because a logarithmic axis has no zero.
     radii_px = np.maximum(study.radii_px, 0.5)
     axes.semilogx(
@@ -93,7 +93,7 @@ def _draw_curves(axes: Any, shown: DistanceResult, study: FresnelStudy) -> None:
     axes.legend(frameon=False, loc="upper right")
 
 
-def _draw_distances(axes: Any, study: FresnelStudy) -> None:
+def _draw_distances(axes: Axes, study: FresnelStudy) -> None:
     distances_mm = [result.distance_mm for result in study.distances]
     singles = np.array([result.phase_largest_points for result in study.distances])
     axes.vlines(
@@ -148,13 +148,13 @@ def design_png(study: DesignStudy, path: str | Path) -> None:
     write_png(figure, path)
 
 
-def _panel(axes: Any, study: DesignStudy, value: _Number) -> None:
+def _panel(axes: Axes, study: DesignStudy, value: _Number) -> None:
     wires = sorted({row.wire_um for row in study.rows})
     for index, wire in enumerate(wires):
         rows = [row for row in study.rows if row.wire_um == wire]
         axes.plot(
             [row.pitch_um for row in rows],
-            [value(row) for row in rows],
+            np.array([value(row) for row in rows], dtype=np.float64),
             color=_COLOURS[index % len(_COLOURS)],
             marker="o",
             markersize=3,
@@ -163,9 +163,14 @@ def _panel(axes: Any, study: DesignStudy, value: _Number) -> None:
         )
     if study.flown is not None:
         axes.plot(
-            [study.flown.pitch_um], [value(study.flown)], marker="*", markersize=13, color="#1b1b1b",
-            linestyle="none", label=f"flown: pitch {study.flown.pitch_um:g}, wire {study.flown.wire_um:g} um",
-        )  # fmt: skip
+            [study.flown.pitch_um],
+            np.array([value(study.flown)], dtype=np.float64),
+            marker="*",
+            markersize=13,
+            color="#1b1b1b",
+            linestyle="none",
+            label=f"flown: pitch {study.flown.pitch_um:g}, wire {study.flown.wire_um:g} um",
+        )
     axes.set_xscale("log")
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))

@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from functools import cache
 from itertools import count
 from pathlib import Path
-from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup, escape
@@ -43,7 +42,7 @@ class Page:
     """
 
     html: str
-    texts: dict[str, Any]
+    texts: dict[str, object]
     figures: list[bytes]
 
 

@@ -10,7 +10,7 @@ import textwrap
 from collections.abc import Iterator, Sequence
 from io import BytesIO
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, Literal, NamedTuple, TypedDict
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -34,8 +34,9 @@ GOLD = LinearSegmentedColormap.from_list("euv_gold", EUV_POINTS).with_extremes(b
 CHANGE = LinearSegmentedColormap.from_list(
     "change", ["#123a7a", "#3f7fc1", "#b9d5ea", "#f7f7f4", "#f6c9a4", "#d5642f", "#7d1a12"]
 ).with_extremes(bad=NO_DATA)
+Dashes = str | tuple[float, Sequence[float]]
 # Colour, width and dashes of each component's curve; thin curves are drawn behind wide ones.
-_CURVES: dict[str, tuple[str, float, Any]] = {
+_CURVES: dict[str, tuple[str, float, Dashes]] = {
     "TOTAL": ("#111111", 2.4, "-"),
     "DIFFRACTION": ("#7b3fa0", 2.0, "-"),
     "SCATTER": ("#e0a100", 2.0, "-"),
@@ -45,17 +46,28 @@ _CURVES: dict[str, tuple[str, float, Any]] = {
     "FILTER_WHEEL": ("#c24a8c", 1.3, "-"),
     "AIRY": ("#8a8a8a", 1.6, (0, (4, 2))),
 }
-_OTHER_CURVE = ("#2b8a6e", 1.3, "-")
+_OTHER_CURVE: tuple[str, float, Dashes] = ("#2b8a6e", 1.3, "-")
 INK = "#222222"
 
 Plane = NDArray[np.floating]
 Vector = NDArray[np.float64]
+LegendPlace = Literal["upper left", "upper center", "upper right", "best"]
 AxesBounds = tuple[float, float, float, float]  # left, bottom, width and height, as fractions of the figure
 
 NEAREST_PX, FARTHEST_PX = 0.5, REACH_GRID_PX / 2
 POINTINGS = ("#1b4f8a", "#c2402f", "#2b8a6e", "#7b3fa0", "#8a6d00", "#5b5b5b")
 _MANY_IMAGES = 60  # with this many images or more, markers are smaller
 _LETTERS_AN_INCH = 11.5
+
+
+class PointStyle(TypedDict):
+    """The style of points with bars, for ``errorbar``."""
+
+    fmt: str
+    color: str
+    markersize: float
+    elinewidth: float
+    markeredgewidth: float
 
 
 class Panel(NamedTuple):
@@ -68,8 +80,10 @@ class Panel(NamedTuple):
     beyond: str
 
 
-def write_png(figure: Figure, target: str | Path | IO[bytes], **options: Any) -> None:
-    """Draw a figure and write it as PNG. options: the options of ``FigureCanvasAgg.print_png``.
+def write_png(
+    figure: Figure, target: str | Path | IO[bytes], *, pil_kwargs: dict[str, int] | None = None
+) -> None:
+    """Draw a figure and write it as PNG. pil_kwargs: options of Pillow's writer of PNG.
 
     Matplotlib reads a text between two dollar signs as a formula, and fails if it is not a formula. Titles and labels
     contain names from files, so they are drawn without this rule. Only the numbers at the axes are formulas, such as
@@ -77,7 +91,7 @@ def write_png(figure: Figure, target: str | Path | IO[bytes], **options: Any) ->
     """
     for text in _plain_texts(figure):
         text.set_parse_math(False)
-    FigureCanvasAgg(figure).print_png(target, **options)
+    FigureCanvasAgg(figure).print_png(target, pil_kwargs=pil_kwargs)
 
 
 def png_of(figure: Figure) -> bytes:
@@ -109,7 +123,7 @@ def tidy(charts: Sequence[Axes]) -> None:
             axes.spines[side].set_visible(False)
 
 
-def points(colour: str, size: float) -> dict[str, Any]:
+def points(colour: str, size: float) -> PointStyle:
     """The style of points with bars, for ``errorbar``."""
     return {"fmt": "o", "color": colour, "markersize": size, "elinewidth": 1.0, "markeredgewidth": 0}
 
@@ -196,13 +210,20 @@ def psf_figure(psf: Psf) -> Figure:
     looks = {name: _CURVES.get(name, _OTHER_CURVE) for name in kernels}
     for name, (colour, width, dashes) in sorted(looks.items(), key=lambda look: look[1][1]):
         kernel = kernels[name]
-        style: dict[str, Any] = {"color": colour, "linewidth": width, "linestyle": dashes}
+
         radius, weight = _smoothed_profile(kernel)
-        profile_axes.loglog(radius, weight, **style)
+        profile_axes.loglog(radius, weight, color=colour, linewidth=width, linestyle=dashes)
         lowest.append(float(weight[-1]) if weight.size else 1.0)
         radii = np.geomspace(0.5, psf.reach_px, 400)
         label = name.capitalize().replace("_", " ") + (" (open aperture)" if name == "AIRY" else "")
-        curve_axes.semilogx(radii, cumulative_curve(kernel, radii), label=label, **style)
+        curve_axes.semilogx(
+            radii,
+            cumulative_curve(kernel, radii),
+            label=label,
+            color=colour,
+            linewidth=width,
+            linestyle=dashes,
+        )
     profile_axes.set(
         xlabel="Radius (px)", ylabel="Mean weight (fraction per pixel)", title="Mean weight by radius"
     )
@@ -295,12 +316,31 @@ def headed_figure(width_in: float, height_in: float, name: str, sentence: str) -
     return figure
 
 
-def legend(axes: Any, size: float = 9, loc: str = "upper right", **options: Any) -> None:
+def legend(
+    axes: Axes,
+    size: float = 9,
+    loc: LegendPlace = "upper right",
+    *,
+    title: str | None = None,
+    title_fontsize: float | None = None,
+    ncols: int = 1,
+    columnspacing: float | None = None,
+    handletextpad: float | None = None,
+) -> None:
     """Draw a legend without a frame."""
-    axes.legend(fontsize=size, loc=loc, frameon=False, **options)
+    axes.legend(
+        fontsize=size,
+        loc=loc,
+        frameon=False,
+        title=title,
+        title_fontsize=title_fontsize,
+        ncols=ncols,
+        columnspacing=columnspacing,
+        handletextpad=handletextpad,
+    )
 
 
-def boxed_legend(axes: Any, size: float = 9, loc: str = "best") -> None:
+def boxed_legend(axes: Axes, size: float = 9, loc: LegendPlace = "best") -> None:
     """Draw a legend of two columns on a white ground, for charts that are full of lines."""
     axes.legend(fontsize=size, loc=loc, frameon=True, framealpha=0.85, edgecolor="none", ncols=2)
 
@@ -333,8 +373,15 @@ def draw_errors(
     span = np.abs(values) + (0.0 if noise is None else noise)
     top = 1.12 * float(span[np.isfinite(span)].max(initial=1e-3))
     axes.set_ylim(-top, 1.35 * top)
-    short = {"columnspacing": 1.0, "handletextpad": 0.2}
-    legend(axes, loc="upper center", title="pointing", title_fontsize=9, ncols=6, **short)
+    legend(
+        axes,
+        loc="upper center",
+        title="pointing",
+        title_fontsize=9,
+        ncols=6,
+        columnspacing=1.0,
+        handletextpad=0.2,
+    )
 
 
 def draw_band(
@@ -360,8 +407,8 @@ def draw_weights_of_shells(
     low_2, low_1, median, high_1, high_2 = np.maximum(limits[:, shown], 1e-30)
     for low, high, alpha, name in ((low_2, high_2, 0.14, "±2 σ"), (low_1, high_1, 0.28, "±1 σ")):
         steps = np.append(low, low[-1]), np.append(high, high[-1])
-        style: dict[str, Any] = {"color": colour, "alpha": alpha, "linewidth": 0}
-        axes.fill_between(edges, *steps, step="post", label=f"free shells, {name}", **style)
+        label = f"free shells, {name}"
+        axes.fill_between(edges, *steps, step="post", label=label, color=colour, alpha=alpha, linewidth=0)
     axes.stairs(median, edges, baseline=None, color=colour, linewidth=1.1, label="free shells, median")
 
 
@@ -379,5 +426,4 @@ def along_distance(axes: Axes, field_px: float, label: str = "Distance (px)") ->
     axes.set(xscale="log", xlim=(NEAREST_PX, FARTHEST_PX), xlabel=label)
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     if field_px < FARTHEST_PX:
-        shade: dict[str, Any] = {"color": "#efefef", "zorder": 0, "linewidth": 0}
-        axes.axvspan(field_px, FARTHEST_PX, label="beyond the field", **shade)
+        axes.axvspan(field_px, FARTHEST_PX, label="beyond the field", color="#efefef", zorder=0, linewidth=0)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
 
 from psfcore.arrays import Vector
 from psfcore.drawing.plots import (
@@ -39,7 +40,7 @@ def evaluation_png(
     """
     rows = 3 if study is None else 4
     figure = headed_figure(16.0, 3.7 * rows + 0.9, title, sentence(evaluation))
-    bands: Any = figure.subfigures(rows, 1)
+    bands = figure.subfigures(rows, 1, squeeze=False)[:, 0]
     *slices, by_centre = bands[0].subplots(1, 4)
     shown = shown_slices(evaluation, _SLICES)
     draw_slices(slices, shown, 8.5)
@@ -82,7 +83,7 @@ def shown_slices(evaluation: Evaluation, most: int) -> list[FrameEvaluation]:
     return [frames[len(frames) // 2] for frames in by_fov][:most]
 
 
-def draw_slices(charts: Sequence[Any], frames: Sequence[FrameEvaluation], letters: float) -> None:
+def draw_slices(charts: Sequence[Axes], frames: Sequence[FrameEvaluation], letters: float) -> None:
     """Draw the slices of each image on a chart, with a legend whose letters have this size. Hide the charts that are
     left.
     """
@@ -93,7 +94,7 @@ def draw_slices(charts: Sequence[Any], frames: Sequence[FrameEvaluation], letter
         axes.set_visible(False)
 
 
-def _draw_slices(axes: Any, frame: FrameEvaluation) -> None:
+def _draw_slices(axes: Axes, frame: FrameEvaluation) -> None:
     """Draw the observed and simulated intensity along x (circles, solid line) and along y (squares, dashed line)."""
     assert frame.along_x is not None and frame.along_y is not None
     dark = frame.along_x.dark
@@ -136,7 +137,7 @@ def _draw_slices(axes: Any, frame: FrameEvaluation) -> None:
     axes.set_title(f"Pointing {frame.pointing}: {frame.file:.20}, {frame.time_s / 60:.0f} min", fontsize=10)
 
 
-def draw_centres(axes: Any, frames: Sequence[FrameEvaluation]) -> None:
+def draw_centres(axes: Axes, frames: Sequence[FrameEvaluation]) -> None:
     """Draw the observed and simulated light at the centre, by time."""
     minutes = each(frames, "time_s") / 60
     observed, simulated = each(frames, "centre_dn_s").T
@@ -155,7 +156,7 @@ def draw_centres(axes: Any, frames: Sequence[FrameEvaluation]) -> None:
     legend(axes, loc="upper left")
 
 
-def draw_maps(band: Any, panels: Sequence[Any], maps: Superposed) -> None:
+def draw_maps(band: Figure | SubFigure, panels: Sequence[Axes], maps: Superposed) -> None:
     """Draw maps of the MPE and the MAPE. Beside each map is the map of noise alone, on the same scale."""
     mpe_top = max(maps.mpe_largest_pct, 1e-3)
     mape_top = max(float(np.nanmax([maps.mape_pct, maps.noise_mape_pct])), 1e-3)
@@ -180,7 +181,7 @@ def draw_maps(band: Any, panels: Sequence[Any], maps: Superposed) -> None:
         band.colorbar(drawn, ax=axes, label="% of the disc's mean", shrink=0.8)
 
 
-def draw_absolute(axes: Any, frames: Sequence[FrameEvaluation]) -> None:
+def draw_absolute(axes: Axes, frames: Sequence[FrameEvaluation]) -> None:
     """Draw the absolute errors by detector x.
 
     The vertical scale is linear near 0 and logarithmic beyond, so that it shows bright and faint discs.
@@ -196,18 +197,30 @@ def draw_absolute(axes: Any, frames: Sequence[FrameEvaluation]) -> None:
     axes.set(ylim=(-top, 2 * top), xlabel=label, ylabel="Simulated - observed (DN/s)", title="Absolute error")
 
 
-def draw_offsets(panels: Sequence[Any], study: DarkOffsetStudy) -> None:
+def draw_offsets(panels: Sequence[Axes], study: DarkOffsetStudy) -> None:
     """Draw the effect of dark offsets: relative change of the weights, and change of C(R) in percentage points."""
     weights, curve = panels
     for axes in panels:
         axes.axhline(0, color="#555555", linewidth=1.0)
         axes.set(xscale="log", xlabel="Distance (px)")
     for n, offset in enumerate(study.offsets):
-        style: dict[str, Any] = {"color": _OFFSETS[n % len(_OFFSETS)], "linewidth": 1.8}
+        colour = _OFFSETS[n % len(_OFFSETS)]
         name = f"{offset.offset_dn:+g} DN"
-        weights.plot(study.radii_px, offset.weight_change_pct, label=name, **style)
-        curve.plot(study.curve_radii_px, offset.curve_change_points, label=f"{name}, diffuse", **style)
-        curve.plot(study.curve_radii_px, offset.total_curve_change_points, linestyle=_DOTS, **style)
+        weights.plot(study.radii_px, offset.weight_change_pct, label=name, color=colour, linewidth=1.8)
+        curve.plot(
+            study.curve_radii_px,
+            offset.curve_change_points,
+            label=f"{name}, diffuse",
+            color=colour,
+            linewidth=1.8,
+        )
+        curve.plot(
+            study.curve_radii_px,
+            offset.total_curve_change_points,
+            linestyle=_DOTS,
+            color=colour,
+            linewidth=1.8,
+        )
     curve.plot([], [], color="#777777", linestyle=_DOTS, label="total PSF (dotted)")
     weights.set(
         ylabel="Change of the diffuse weight (%)",

@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -155,10 +155,10 @@ def each(frames: Sequence[FrameEvaluation], name: str) -> Vector:
 # --- as JSON ----------------------------------------------------------------------------------------------
 
 
-def report(evaluation: Evaluation, study: DarkOffsetStudy | None = None) -> dict[str, Any]:
+def report(evaluation: Evaluation, study: DarkOffsetStudy | None = None) -> dict[str, object]:
     """The evaluation as JSON: summaries, trends, every image, maps, slices and the dark offsets of `study`."""
     *pointings, whole = summaries(evaluation)
-    out: dict[str, Any] = {
+    out: dict[str, object] = {
         "schema": SCHEMA,
         "all": json_values(whole),
         "pointings": json_values(pointings),
@@ -183,7 +183,7 @@ def report(evaluation: Evaluation, study: DarkOffsetStudy | None = None) -> dict
     return out
 
 
-def _frame_json(frame: FrameEvaluation) -> dict[str, Any]:
+def _frame_json(frame: FrameEvaluation) -> dict[str, object]:
     centre_observed, centre_simulated = frame.centre_dn_s
     return {
         "file": frame.file,
@@ -201,7 +201,7 @@ def _frame_json(frame: FrameEvaluation) -> dict[str, Any]:
     }
 
 
-def _superposed_json(maps: Superposed) -> dict[str, Any]:
+def _superposed_json(maps: Superposed) -> dict[str, object]:
     return {
         "images": maps.images,
         "registered": "to the nearest pixel",
@@ -212,7 +212,7 @@ def _superposed_json(maps: Superposed) -> dict[str, Any]:
     }
 
 
-def _study_json(study: DarkOffsetStudy) -> dict[str, Any]:
+def _study_json(study: DarkOffsetStudy) -> dict[str, object]:
     changes = ("weight_change_pct", "curve_change_points", "total_curve_change_points")
     return {
         **json_attributes(study, "radii_px", "curve_radii_px", "nominal"),

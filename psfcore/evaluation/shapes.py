@@ -23,7 +23,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -64,7 +63,7 @@ class ShapeErrors:
     figures: dict[str, tuple[float, float]]
     minus_first: dict[str, tuple[float, float]]
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Plain values."""
         return {
             "name": self.name,
@@ -82,7 +81,7 @@ class ShapesByErrors:
     folds: int
     shapes: tuple[ShapeErrors, ...]
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Plain values."""
         return {
             "images": self.images,

@@ -7,7 +7,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 from psfcore.errors import HeaderError
 from psfcore.limited import run_limited, scratch_file
@@ -30,7 +30,7 @@ def decompressed(path: Path, most_bytes: int) -> Iterator[tuple[BinaryIO, Header
         yield plain, HeaderError(**answer) if answer else None
 
 
-def decompress(target: BinaryIO, *, path: str, most_bytes: int) -> dict[str, Any]:
+def decompress(target: BinaryIO, *, path: str, most_bytes: int) -> dict[str, object]:
     """Write the decompressed bytes to ``target``; returns the code and the message of the error that ended them."""
     left = most_bytes
     try:

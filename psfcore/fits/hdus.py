@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 from astropy.io import fits
@@ -204,7 +204,7 @@ def _decoded_pixels(
 
 def decode_tiles(
     target: BinaryIO, *, path: str, number: int, shape: list[int], twice: bool
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Write the pixels of a tile-compressed image to ``target``; returns the type of its numbers, and whether DATASUM
     contradicts its tiles.
 
@@ -262,7 +262,7 @@ def ascii_text(text: str) -> str:
     return "".join(c if " " <= c <= "~" else " " if c.isspace() else "?" for c in text)
 
 
-def as_written(hdu: Any) -> bool:
+def as_written(hdu: fits.PrimaryHDU | fits.ImageHDU) -> bool:
     """Whether an HDU is unchanged since `write_hdus` wrote it: its checksums are correct, and `write_hdus` computed
     them.
     """
@@ -272,7 +272,7 @@ def as_written(hdu: Any) -> bool:
     return all(ours) and hdu.verify_datasum() == hdu.verify_checksum() == _RIGHT
 
 
-def write_hdus(path: str | Path, hdus: list[Any]) -> None:
+def write_hdus(path: str | Path, hdus: list[fits.PrimaryHDU | fits.ImageHDU]) -> None:
     """Write HDUs with checksums, but without a date of writing.
 
     Raises OSError. If the system refuses to write, for example because the disk is full, the error has the system's

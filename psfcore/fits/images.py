@@ -161,7 +161,7 @@ def write_image(
     header.update(_ascii(cards))
     for line in history:
         header.add_history(ascii_text(line))
-    hdus: list[Any] = [fits.PrimaryHDU(pixels, header)]
+    hdus: list[fits.PrimaryHDU | fits.ImageHDU] = [fits.PrimaryHDU(pixels, header)]
     for name, plane in (planes or {}).items():
         _check_plane(name, plane, pixels.shape, taken=[hdu.name for hdu in hdus])
         hdus.append(_plane_hdu(name, plane, header, image.unit, (plane_bits or {}).get(name)))

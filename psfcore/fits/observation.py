@@ -10,10 +10,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from astropy.io.fits import Header
+from astropy.io.fits import Header, ImageHDU
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError
@@ -58,7 +57,11 @@ def read_observation(
 
 
 def observation_of_hdus(
-    hdus: Mapping[int, Any], number: int, *, chosen: int | None = None, saturation_dn: float | None = None
+    hdus: Mapping[int, ImageHDU],
+    number: int,
+    *,
+    chosen: int | None = None,
+    saturation_dn: float | None = None,
 ) -> Image:
     """The image of one HDU of astropy, with the planes in the HDUs after it. hdus: the HDUs with an image of two axes,
     by their numbers.

@@ -38,7 +38,9 @@ def write_psf(path: str | Path, psf: Psf, *, instrument_file: bytes | None = Non
     float32. The rounding changes each weight by at most 6e-8 of its value, and the sum by less than 1e-7.
     instrument_file: the TOML text from which the PSF was built. It is stored unchanged in INSTRUMENT.
     """
-    hdus: list[Any] = [fits.PrimaryHDU(psf.kernel.astype(np.float32), _psf_header(psf))]
+    hdus: list[fits.PrimaryHDU | fits.ImageHDU] = [
+        fits.PrimaryHDU(psf.kernel.astype(np.float32), _psf_header(psf))
+    ]
     for name, kernel in psf.components.items():
         component = fits.ImageHDU(kernel.astype(np.float32), name=ascii_text(name).upper())
         component.header["PSFSUM"] = (float(kernel.sum()), "sum of weights on this array")
@@ -189,7 +191,7 @@ def stated_id(path: str | Path, limits: FitsLimits) -> str | None:
     return stated[0] if good else None
 
 
-def check_written(_target: BinaryIO, *, path: str, count: int) -> dict[str, Any]:
+def check_written(_target: BinaryIO, *, path: str, count: int) -> dict[str, object]:
     """Whether the first HDUs of a file are as `write_psf` wrote them ("good"). Call it in a limited process
     (`psfcore.limited`).
     """
@@ -216,13 +218,13 @@ def _read_extras(
     return components, extras["provenance"], None if fitted is None else _fitted(**fitted)
 
 
-def write_extras(target: BinaryIO, *, path: str, count: int, shape: list[int]) -> dict[str, Any]:
+def write_extras(target: BinaryIO, *, path: str, count: int, shape: list[int]) -> dict[str, object]:
     """Write the components of a PSF to ``target``, float64; returns their names, the provenance and the fitted shape.
 
     HDUs that `write_psf` never writes are ignored: compressed components, components of another shape, and tables with
     data outside their rows. Call it in a limited process (`psfcore.limited`).
     """
-    provenance: dict[str, Any] = {}
+    provenance: dict[str, object] = {}
     extras: dict[str, Any] = {"components": [], "provenance": provenance, "fitted": None}
     with readable_pixels(path, "the extensions"), _first_hdus(path, count) as hdus:
         provenance["history"] = [str(line) for line in hdus[0].header.get("HISTORY", [])]
@@ -247,7 +249,7 @@ def write_extras(target: BinaryIO, *, path: str, count: int, shape: list[int]) -
 
 
 def _fitted(
-    shape: str, parameters: list[str], coordinates: list[float], covariances: list[Any]
+    shape: str, parameters: list[str], coordinates: list[float], covariances: list[list[float]]
 ) -> FittedShape:
     rows = np.reshape(covariances, (len(parameters), -1)).tolist()  # of one parameter, a row is a number
     return FittedShape(shape, tuple(parameters), tuple(coordinates), tuple(map(tuple, rows)))
@@ -259,7 +261,7 @@ def _pixels(hdus: Sequence[Hdu]) -> int:
 
 
 @contextmanager
-def _first_hdus(path: str, count: int) -> Iterator[list[Any]]:
+def _first_hdus(path: str, count: int) -> Iterator[list[fits.PrimaryHDU | fits.ImageHDU]]:
     """The first HDUs of a file. count: as many as `all_hdus` finds.
 
     If a damaged size ends an HDU too early, astropy takes what follows for a header, and may read on without an end.

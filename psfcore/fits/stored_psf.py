@@ -8,7 +8,7 @@ import math
 import os
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits
@@ -41,7 +41,7 @@ def check_no_product(summary: HeaderSummary) -> None:
         )
 
 
-def read_weights(target: BinaryIO, *, path: str, limits: dict[str, int]) -> dict[str, Any]:
+def read_weights(target: BinaryIO, *, path: str, limits: dict[str, int]) -> dict[str, object]:
     """Read a PSF and check it. Nothing is written to ``target``. Raises the errors of `psfcore.fits.psfs.read_psf`."""
     from psfcore.fits.psfs import read_psf  # loads the numerical libraries
 
@@ -61,7 +61,7 @@ def write_cutout(path: str | Path, size: int, limits: FitsLimits, target: Binary
     run_limited(cut_psf, path, target, pixels=math.prod(shape), size=size, limits=asdict(limits))
 
 
-def cut_psf(target: BinaryIO, *, path: str, size: int, limits: dict[str, int]) -> dict[str, Any]:
+def cut_psf(target: BinaryIO, *, path: str, size: int, limits: dict[str, int]) -> dict[str, object]:
     """Write the cut-out of a PSF to ``target``. Call it in a limited process (`psfcore.limited`)."""
     from astropy.io import fits
 

@@ -32,7 +32,6 @@ the shape of the PSF: the light between the orders relative to the light in the 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,7 +97,7 @@ class FlareFit:
     matched: float
     matched_noise_pct: float | None
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, object]:
         """All fields as JSON values; `flare_light` is the sum of the box."""
         return {
             **json_attributes(self, "rms_pct", "chi2_per_distance", "reduced_chi2", "used_pixels"),
@@ -136,7 +135,7 @@ class FlareComparison:
             return None
         return alone / self.total.chi2_per_distance
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, object]:
         """The comparison as JSON, with the profile."""
         return {
             **json_attributes(self.profile, "centre_xy", "arm_deg", "distance_px", "observed", "sigma"),

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -61,8 +61,8 @@ def _summary(name: str, fit: FlareFit) -> str:
 
 
 def _draw_flare(
-    figure: Any,
-    axes: Any,
+    figure: Figure,
+    axes: Axes,
     difference: NDArray[np.float64],
     usable: NDArray[np.bool_],
     found: FlareComparison,
@@ -91,7 +91,7 @@ def _draw_flare(
     figure.colorbar(drawn, ax=axes, shrink=0.8, label=unit)
 
 
-def _draw_profile(axes: Any, found: FlareComparison, unit: str) -> None:
+def _draw_profile(axes: Axes, found: FlareComparison, unit: str) -> None:
     profile = found.profile
     axes.errorbar(
         profile.distance_px,
@@ -115,7 +115,7 @@ def _draw_profile(axes: Any, found: FlareComparison, unit: str) -> None:
     axes.legend(frameon=False)
 
 
-def _draw_residuals(axes: Any, found: FlareComparison) -> None:
+def _draw_residuals(axes: Axes, found: FlareComparison) -> None:
     """Draw simulated minus observed, divided by the noise, or by the observed light if the noise is unknown."""
     profile = found.profile
     unit = np.maximum(profile.observed, 1e-300) / 100 if profile.sigma is None else profile.sigma
@@ -159,7 +159,7 @@ def arms_png(image: NDArray[np.float64], found: ArmMeasurement, path: str | Path
 
 
 def _draw_image(
-    figure: Figure, axes: Any, image: NDArray[np.float64], found: ArmMeasurement, unit: str
+    figure: Figure, axes: Axes, image: NDArray[np.float64], found: ArmMeasurement, unit: str
 ) -> None:
     lit = np.abs(found.model[found.fitted])
     top = float(np.percentile(lit, 99.5)) * 3 if lit.size else 1.0
@@ -176,7 +176,7 @@ def _draw_image(
     figure.colorbar(drawn, ax=axes, shrink=0.8, label=unit)
 
 
-def _draw_cuts(axes: Any, image: NDArray[np.float64], found: ArmMeasurement) -> None:
+def _draw_cuts(axes: Axes, image: NDArray[np.float64], found: ArmMeasurement) -> None:
     """Draw image and fit along each arm at the fitted pixels. The curves of the arms are drawn one above the other."""
     reach = max((abs(peak.order) for peak in found.peaks), default=1) * found.spacing_px + 5
     along = np.arange(-reach, reach, 0.25)

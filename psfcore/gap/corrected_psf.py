@@ -15,7 +15,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -30,7 +29,7 @@ from psfcore.scatter.total_psf import Lanes, Optics, TotalPsf
 from psfcore.transit.transit import Place
 
 
-def corrected_psf(found: Diagnosis, name: str, version: str, provenance: dict[str, Any]) -> Psf:
+def corrected_psf(found: Diagnosis, name: str, version: str, provenance: dict[str, object]) -> Psf:
     """The corrected PSF of a diagnosis, on the full reach, with the components DIFFRACTION and SCATTER.
 
     provenance: the software and the parents of the PSF. This function adds the effects, their parameters with errors,

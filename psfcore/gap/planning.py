@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -23,6 +22,7 @@ from psfcore.gap.evidence.closed_form import ClosedForm
 from psfcore.gap.evidence.expected_gap import linear_model_of
 from psfcore.gap.evidence.tree import SUN
 from psfcore.gap.library.registry import LIBRARY
+from psfcore.gap.schema import PointingJson
 from psfcore.gap.verdict.answer import FLOOR
 from psfcore.gap.verdict.limits import Limits, limits
 from psfcore.gap.view import View
@@ -60,18 +60,24 @@ class Planned:
     left_out: dict[str, str]
 
     @property
-    def pointings(self) -> list[dict[str, Any]]:
+    def pointings(self) -> list[PointingJson]:
         """For each pointing: its number, its view (the part of the Sun), the number of images, and the exposure times,
         s.
         """
         rows = []
         for pointing in self.plan.pointings:
             exposures = [shot.exposure_s for shot in self.plan.shots if shot.pointing == pointing]
-            row = {"pointing": pointing, "view": self.plan.views[pointing - 1], "images": len(exposures)}
-            rows.append(row | {"exposures_s": sorted(set(exposures))})
+            rows.append(
+                PointingJson(
+                    pointing=pointing,
+                    view=self.plan.views[pointing - 1],
+                    images=len(exposures),
+                    exposures_s=sorted(set(exposures)),
+                )
+            )
         return rows
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, object]:
         """The plan and its limits, schema gap-plan/1. A limit `excluded_95` needs data, so it is missing here."""
         plan = {"images": len(self.plan.shots), "size_px": self.plan.size_px, "pointings": self.pointings}
         distances = sorted(self.limits.distances.items(), key=lambda one: one[1])

@@ -11,7 +11,7 @@ import gc
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
-from typing import Any, TypeVar, cast
+from typing import TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,7 +59,7 @@ class View:
     solution: Solution
 
     @cached_property
-    def _results(self) -> dict[str, Any]:
+    def _results(self) -> dict[str, object]:
         return {}
 
     def once(self, name: str, compute: Callable[[], Result]) -> Result:

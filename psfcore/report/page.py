@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from psfcore.arrays import Vector
 from psfcore.drawing.numbers import DASH, with_error
 from psfcore.drawing.page import Page, render
 from psfcore.evaluation.evaluation import (
@@ -98,7 +99,7 @@ def _bands_at(cross: CrossValidated, radius: float) -> Row:
     return [DASH] * 3 if at.size == 0 else _band(cross.bands.curve_pct[:, at[0]], ".2f")
 
 
-def _band(limits: Any, digits: str) -> Row:
+def _band(limits: Vector, digits: str) -> Row:
     """The median, and the ranges of one and of two standard deviations."""
     low_2, low_1, median, high_1, high_2 = (f"{limit:{digits}}" for limit in limits)
     return [median, f"{low_1} to {high_1}", f"{low_2} to {high_2}"]
@@ -214,7 +215,7 @@ def image_rows(report: PsfReport) -> list[Row]:
     ]
 
 
-_FUNCTIONS: dict[str, Callable[..., Any]] = {
+_FUNCTIONS: dict[str, Callable[..., object]] = {
     one.__name__: one
     for one in (
         *(chi2_error, curve_table, fold_rows, image_rows, limits_of),

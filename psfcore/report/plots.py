@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from psfcore.arrays import Matrix, Vector
@@ -75,7 +74,7 @@ def curves_png(report: PsfReport) -> bytes:
     return _tidy_png(figure, charts)
 
 
-def _draw_curve(axes: Any, report: PsfReport, name: str, title: str) -> None:
+def _draw_curve(axes: Axes, report: PsfReport, name: str, title: str) -> None:
     """Draw 1 - encircled energy of a component, with its error."""
     radii, beyond, sigma = beyond_of(report.tables, name)
     axes.fill_between(radii, beyond - sigma, beyond + sigma, color=_COLOURS[name], alpha=0.3, linewidth=0)
@@ -84,7 +83,7 @@ def _draw_curve(axes: Any, report: PsfReport, name: str, title: str) -> None:
     along_distance(axes, max(report.transit.shape), "Distance R (px)")
 
 
-def _draw_spread(axes: Any, report: PsfReport, name: str) -> None:
+def _draw_spread(axes: Axes, report: PsfReport, name: str) -> None:
     """Draw differences from the fitted curve of a component: bands of the folds, and bars for the error of the fit."""
     radii, _, sigma = beyond_of(report.tables, name)
     found = _folds_of(report, name)
@@ -130,7 +129,7 @@ def _scatter_from(report: PsfReport, edges: Vector) -> Vector:
     return np.asarray(np.where(exact, beyond[within], np.interp(just_below, radii, beyond)))
 
 
-def _draw_free(curve: Any, spread: Any, report: PsfReport, shells: ShellBands) -> None:
+def _draw_free(curve: Axes, spread: Axes, report: PsfReport, shells: ShellBands) -> None:
     """Draw the diffuse light beyond the inner edge of each free shell within the field: median and spread of the
     folds.
     """
@@ -247,7 +246,9 @@ def residuals_png(evaluation: Evaluation) -> bytes:
         values = each(frames, f"{key or 'residual_'}pct")
         for axes, (label, at) in zip(charts[3 * row :], positions(frames).items(), strict=False):
             draw_errors(axes, pointings(frames), at, values, each(frames, f"{key}noise_pct"))
-            axes.get_legend().remove()
+            shown = axes.get_legend()
+            if shown is not None:
+                shown.remove()
             axes.set(xlabel=label if row else "")
         charts[3 * row].set_ylabel(f"{name}: residual (%)")
     labelled = charts[0].get_legend_handles_labels()
@@ -273,7 +274,7 @@ def offsets_png(study: DarkOffsetStudy) -> bytes:
     return _tidy_png(figure, charts)
 
 
-def _tidy_png(figure: Figure, charts: list[Any]) -> bytes:
+def _tidy_png(figure: Figure, charts: list[Axes]) -> bytes:
     """A figure as PNG, with tidy charts."""
     tidy(charts)
     return png_of(figure)
@@ -286,7 +287,7 @@ def _figure(
     rows: int = 1,
     *,
     heights: tuple[float, ...] | None = None,
-) -> tuple[Any, list[Any]]:
+) -> tuple[Figure, list[Axes]]:
     """A figure and its charts, row by row. heights: relative heights of the rows."""
     figure = Figure(figsize=(width_in, height_in), dpi=PLOT_DPI, facecolor="white", layout="constrained")
     charts = figure.subplots(rows, across, squeeze=False, height_ratios=heights)

@@ -26,6 +26,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -179,14 +180,11 @@ def fit_transit(
     kernel, scatter, curve, diffuse = _on_full_reach(solution, factor, threads)
     free = _free_shells(solution, seed, progress) if form.isotropic else None
     shapes = compare_shapes(solution, progress=progress) if power_law else ()
-    options: dict[str, Any] = {"seed": seed, "threads": threads, "progress": progress}
+    invert_at = partial(invert_as_published, transit, seed=seed, threads=threads, progress=progress)
     published, alone = None, {}
     if as_published:
-        published = invert_as_published(transit, AS_PUBLISHED, **options)
-        alone = {
-            name: invert_as_published(transit, choices, subsets=ALONE_SUBSETS, **options)
-            for name, choices in CORRECTED_ALONE.items()
-        }
+        published = invert_at(AS_PUBLISHED)
+        alone = {name: invert_at(choices, subsets=ALONE_SUBSETS) for name, choices in CORRECTED_ALONE.items()}
     return TransitFit(
         transit=transit,
         solution=solution,
@@ -352,7 +350,7 @@ def _counted(count: int, noun: str) -> str:
     return f"{count} {noun}{'s' if count > 1 else ''}"
 
 
-def fitted_psf(fit: TransitFit, *, name: str, version: str, provenance: dict[str, Any]) -> Psf:
+def fitted_psf(fit: TransitFit, *, name: str, version: str, provenance: dict[str, object]) -> Psf:
     """The fitted PSF, on the full reach (2048 px x 2048 px), with its components DIFFRACTION and SCATTER."""
     named = {"name": name, "version": version, "provenance": provenance}
     return psf_of_fit(fit.kernel, fit.scatter, fit.solution, fit.covariance, **named)
@@ -385,7 +383,7 @@ def fit_json(fit: TransitFit) -> dict[str, Any]:
     """The fit as JSON: parameters and curves with errors, every image, the alternative fits, and the limits."""
     inversion = fit.inversion
     values, sigma = inversion.values, fit.value_sigma
-    out: dict[str, Any] = {
+    out: dict[str, object] = {
         "schema": SCHEMA,
         "sentence": fit_sentence(fit),
         "shape": inversion.shape.name,
@@ -473,10 +471,10 @@ def _curve_json(curve: Curve) -> dict[str, list[float]]:
     }
 
 
-def _published_json(fit: TransitFit, published: Published) -> dict[str, Any]:
+def _published_json(fit: TransitFit, published: Published) -> dict[str, object]:
     here = dict(zip(fit.curve.radii_px, fit.curve.pct, strict=True))
 
-    def one(p: Published) -> dict[str, Any]:
+    def one(p: Published) -> dict[str, object]:
         return {
             **json_attributes(p, "a", "b_px", "c", "total", "radii_px"),
             "counted_on_grid_px": p.grid_px,

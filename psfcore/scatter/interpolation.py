@@ -33,7 +33,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
-from typing import Any
 
 import numpy as np
 
@@ -118,7 +117,7 @@ def interpolated_psf(
     *,
     name: str,
     version: str,
-    provenance: Mapping[str, Any],
+    provenance: Mapping[str, object],
     threads: int = 1,
 ) -> Psf:
     """The total PSF at a time between two epochs, on the array of the two PSFs, with its components and its errors.
@@ -180,7 +179,7 @@ def interpolated_psf(
     )
 
 
-def parameters_of(fitted: FittedShape) -> dict[str, dict[str, Any]]:
+def parameters_of(fitted: FittedShape) -> dict[str, dict[str, float | str]]:
     """The parameters of a fitted shape by name: value, standard error (sigma), unit and meaning."""
     shape, at = shape_named(fitted.shape), np.array(fitted.coordinates)
     return shape.described(shape.values(at), shape.value_sigma(at, np.array(fitted.covariance)))
@@ -230,10 +229,16 @@ def _check_same_telescope(before: Psf, after: Psf) -> None:
         )
 
 
-def _same(one: Any, other: Any, tolerance: float | None) -> bool:
-    if tolerance is None or not one or not other:
-        return bool(one == other)
-    return bool(abs(one / other - 1) <= tolerance)
+def _same(one: object, other: object, tolerance: float | None) -> bool:
+    if (
+        tolerance is not None
+        and isinstance(one, int | float)
+        and isinstance(other, int | float)
+        and one
+        and other
+    ):
+        return abs(one / other - 1) <= tolerance
+    return one == other
 
 
 def _check_same_diffraction(before: Psf, after: Psf) -> None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
@@ -73,7 +73,7 @@ def fit_figure(fit: TransitFit) -> Figure:
     return figure
 
 
-def _draw_weights(axes: Any, fit: TransitFit) -> None:
+def _draw_weights(axes: Axes, fit: TransitFit) -> None:
     """Draw the weight per pixel by distance: the fitted shape with its error, the free shells, the published power
     law.
     """
@@ -116,7 +116,7 @@ def _fitted_weights(fit: TransitFit) -> tuple[Vector, Vector, Vector]:
     return radius, weight, np.sqrt(np.maximum(variance, 0.0))
 
 
-def _draw_light(axes: Any, fit: TransitFit) -> None:
+def _draw_light(axes: Axes, fit: TransitFit) -> None:
     """Draw C(R) of the total PSF and of the scatter kernel with errors, and both curves of the published recipe."""
     radii = np.geomspace(NEAREST_PX, FARTHEST_PX, 300)
     for kernel, curve, colour, name in (
@@ -135,8 +135,7 @@ def _draw_light(axes: Any, fit: TransitFit) -> None:
     legend(axes)
 
 
-def _draw_published_light(axes: Any, published: Published) -> None:
-    style: dict[str, Any] = {"color": _PUBLISHED, "linewidth": 1.5}
+def _draw_published_light(axes: Axes, published: Published) -> None:
     axes.plot(
         published.radii_px,
         published.curve_pct,
@@ -145,14 +144,17 @@ def _draw_published_light(axes: Any, published: Published) -> None:
         markerfacecolor="white",
         linestyle=_DASHES,
         label="total, as published",
-        **style,
+        color=_PUBLISHED,
+        linewidth=1.5,
     )
     radii = np.geomspace(NEAREST_PX, published.grid_px / 2, 200)
     beyond = cumulative_curve(published.scatter, radii)
-    axes.plot(radii, beyond, linestyle=(0, (1, 1.5)), label="diffuse, as published", **style)
+    axes.plot(
+        radii, beyond, linestyle=(0, (1, 1.5)), label="diffuse, as published", color=_PUBLISHED, linewidth=1.5
+    )
 
 
-def _draw_rounds(axes: Any, fit: TransitFit) -> None:
+def _draw_rounds(axes: Axes, fit: TransitFit) -> None:
     """Draw the largest change of the curve in each round. Markers are filled for rounds that use all images."""
     rounds = fit.inversion.rounds
     number = np.arange(1, len(rounds) + 1)
@@ -176,7 +178,7 @@ def _draw_rounds(axes: Any, fit: TransitFit) -> None:
     legend(axes)
 
 
-def _draw_first_guess(axes: Any, fit: TransitFit) -> None:
+def _draw_first_guess(axes: Axes, fit: TransitFit) -> None:
     """Draw the first guess of the light beyond the disc's radius, by estimator and pointing, and the fitted value.
 
     The logarithmic axis cannot show ratios of 0 or less, so they are omitted.
@@ -184,13 +186,23 @@ def _draw_first_guess(axes: Any, fit: TransitFit) -> None:
     guess = fit.first_guess
     time_min = np.array([f.time_s for f in guess.frames]) / 60
     ratios = {name: np.array([100 * f.ratio[name] for f in guess.frames]) for name in ESTIMATORS}
-    style: dict[str, Any] = {"markersize": marker_size(len(guess.frames)), "markeredgewidth": 0}
+    size = marker_size(len(guess.frames))
     for _, of_pointing, colour in by_pointing([f.pointing for f in guess.frames]):
         for name, marker in _ESTIMATOR_STYLES.items():
             here = of_pointing & (ratios[name] > 0)
-            axes.plot(time_min[here], ratios[name][here], marker, color=colour, **style)
+            axes.plot(
+                time_min[here], ratios[name][here], marker, color=colour, markersize=size, markeredgewidth=0
+            )
     for name, marker in _ESTIMATOR_STYLES.items():
-        axes.plot([], [], marker, color="#777777", label="relative to " + name.replace("_", " "), **style)
+        axes.plot(
+            [],
+            [],
+            marker,
+            color="#777777",
+            label="relative to " + name.replace("_", " "),
+            markersize=size,
+            markeredgewidth=0,
+        )
     fitted = float(cumulative_curve(fit.kernel, [guess.radius_px])[0])
     axes.axhline(
         fitted,
@@ -244,7 +256,7 @@ def cross_validation_png(
     write_png(figure, path)
 
 
-def _draw_shells(charts: Sequence[Any], shells: ShellBands) -> None:
+def _draw_shells(charts: Sequence[Axes], shells: ShellBands) -> None:
     """Compare the free fits with the formula: weight per pixel, 1 - encircled energy of the scatter, and the excess
     within each distance (light of the free fits minus light of the formula) with its error.
     """

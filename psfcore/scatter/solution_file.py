@@ -19,13 +19,14 @@ import json
 import zipfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
+from psfcore.arrays import Number
 from psfcore.errors import DataError
 from psfcore.files import whole_file
 from psfcore.scatter.reconstruction import FrameFit, Inversion, Round, Solution, TransitScenes
@@ -73,7 +74,7 @@ def write_solution(path: Path, solution: Solution) -> None:
         left_out=inversion.left_out,
     )
     text = json.dumps(asdict(contents), default=lambda scalar: scalar.item())  # NumPy's scalars
-    arrays: dict[str, NDArray[Any]] = {_CONTENTS: np.frombuffer(text.encode(), np.uint8)}
+    arrays: dict[str, NDArray[np.generic]] = {_CONTENTS: np.frombuffer(text.encode(), np.uint8)}
     for name in ("coordinates", "covariance", "curve_pct", "curve_sigma"):
         arrays[name] = getattr(inversion, name)
     for name in (*_NUMBERS_OF_FRAMES, *_ARRAYS_OF_FRAMES):
@@ -108,7 +109,7 @@ def read_solution(path: Path, transit: Transit, *, threads: int = 1) -> Solution
     raise DataError("bad-solution", f"expected a kept solution of this transit, of file version 1: {why}")
 
 
-def _array(archive: NpzFile, name: str, kind: type, *shape: int | None) -> NDArray[Any]:
+def _array(archive: NpzFile, name: str, kind: type[Number], *shape: int | None) -> NDArray[Number]:
     """An array of the archive. None in `shape` allows any length. Raises ValueError if type or shape are others."""
     array = archive[name]
     fits = array.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))

@@ -32,7 +32,6 @@ radius; the PSF is given. In high-only images, pixels that clip are left out.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -91,7 +90,7 @@ class PhotonBound:
     stretch_angle_deg: float
     places_px: tuple[tuple[float, float], ...]
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Plain values, as `heliopsf simulate bound --json` writes them."""
         return {
             "images": self.images,

@@ -16,7 +16,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 from psfcore.arrays import Plane
 from psfcore.build import build_psf
@@ -174,7 +174,7 @@ def _exposures_of_headers(
     return rows
 
 
-def _size_of_manifest(content: Mapping[str, Any]) -> int:
+def _size_of_manifest(content: Mapping[str, object]) -> int:
     size = content.get("size_px")
     if not isinstance(size, int) or isinstance(size, bool):
         raise _bad(
@@ -188,9 +188,9 @@ def _exposures_of_manifest(images: Sequence[Mapping[str, Any]]) -> list[tuple[fl
     """Exposure time, gain mode and time of each image, from transit.json."""
     rows = []
     for number, image in enumerate(images):
-        exposure_s: Any = image.get("exposure_s")
-        gain_mode: Any = image.get("gain_mode", HIGH)
-        time_s: Any = image.get("time_s", number * _INTERVAL_S)
+        exposure_s = image.get("exposure_s")
+        gain_mode = image.get("gain_mode", HIGH)
+        time_s = image.get("time_s", number * _INTERVAL_S)
         label = f"{MANIFEST_NAME}: images[{number}]"
         if not _is_number(exposure_s):
             raise _bad(
@@ -206,11 +206,11 @@ def _exposures_of_manifest(images: Sequence[Mapping[str, Any]]) -> list[tuple[fl
     return rows
 
 
-def _is_number(value: Any) -> bool:
+def _is_number(value: object) -> TypeGuard[float]:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _views(content: Mapping[str, Any], count: int) -> tuple[str, ...]:
+def _views(content: Mapping[str, object], count: int) -> tuple[str, ...]:
     """The view of each pointing, as the file states it.
 
     Default: three pointings show the east limb, the disc and the west limb; with any other number, all pointings show

@@ -112,7 +112,7 @@ class Plan:
         """The exact position and the radius of the occulter in an image."""
         return Place(self.shots[index].x_px, self.shots[index].y_px, self.radius_px)
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, object]:
         """Plain values; plan_from_json reads them."""
         content = dataclasses.asdict(self)
         content["shots"] = [

@@ -37,7 +37,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -275,7 +274,7 @@ def write(simulated: SimulatedTransit, folder: str | Path) -> None:
 def write_observation(
     folder: Path,
     plan: Plan,
-    exposures: Sequence[NDArray[Any]],
+    exposures: Sequence[NDArray[np.generic]],
     places: Sequence[Place],
     diffraction: Plane,
     imitated: Imitated = HRI_EUV,
@@ -338,5 +337,5 @@ def read_sky(folder: str | Path, *, threads: int = 1) -> TrueSky:
     return true_sky(plan, scatter, diffraction, seed, scenes=scenes, threads=threads)
 
 
-def _write_json(path: Path, content: dict[str, Any]) -> None:
+def _write_json(path: Path, content: Mapping[str, object]) -> None:
     path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")

@@ -198,7 +198,7 @@ def compare(one: Tables, other: Tables) -> dict[str, Any]:
     }
 
 
-def _about(tables: Tables) -> dict[str, Any]:
+def _about(tables: Tables) -> dict[str, object]:
     """The fields that identify a PSF in an answer."""
     return {
         "name": tables["name"],

@@ -26,7 +26,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,7 +99,7 @@ class FirstGuess:
     share_spread: float
     radius_px: float
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """The first guess as JSON values; NaN and infinity become null. The keys "best_fov" and "fov" contain
         the number of a pointing.
         """

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import IO, Any, BinaryIO, Literal, NamedTuple, cast
+from typing import IO, BinaryIO, Literal, NamedTuple, cast
 
 from psfcore.errors import DataError
 from psfcore.files import GZIP_START
@@ -98,8 +98,8 @@ class _Entry:
 
 
 def copy_files(
-    target: BinaryIO, *, path: str, limits: dict[str, Any], start_bytes: int | None
-) -> dict[str, Any]:
+    target: BinaryIO, *, path: str, limits: dict[str, int], start_bytes: int | None
+) -> dict[str, object]:
     """Find the files of a transit in its archive, and copy them to ``target``. Call it in a limited process.
 
     Returns "kind", and "files" with the values of a ``Copied`` for each file. Files of folders beside the transit are

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,7 +84,7 @@ class Prepared:
         """The number of unfilled saturated pixels in all frames."""
         return sum(frame.unfilled for frame in self.frames)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """JSON values: the number of frames, and the counts of the frames that have saturated or not finite pixels."""
         counts = [asdict(frame) for frame in self.frames if frame.saturated or frame.nonfinite]
         return {"images": len(self.frames), "unfilled": self.unfilled, "frames": counts}

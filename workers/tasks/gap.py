@@ -70,14 +70,15 @@ def gap_diagnose(workspace: Workspace, request: ResolvedGapDiagnose, identity: s
                     corrected, corrected_id, origin="fitted", details=details, threads=workspace.threads
                 )
             )
-    content = gap_report(found) | {"provenance": provenance | {"corrected_psf_id": corrected_id}}
+    content = gap_report(found)
+    content["provenance"] = provenance | {"corrected_psf_id": corrected_id}
     workspace.add(
         report_result(
             identity,
             KIND,
             content,
             {
-                **{name: content[name] for name in _SHOWN},
+                **{name: value for name, value in content.items() if name in _SHOWN},
                 "strongest_axis": content["where"][0]["axis"],
                 "psf_id": request.psf_id,
                 "corrected_psf_id": corrected_id,

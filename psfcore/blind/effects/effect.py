@@ -29,9 +29,10 @@ from numpy.typing import NDArray
 from psfcore.simulate.plan import Plan, Shot
 
 Plane = NDArray[np.float64]
-Function = TypeVar("Function", bound=Callable[..., Any])
+Value = TypeVar("Value")
+Function = TypeVar("Function", bound=Callable[..., object])
 # How a parameter is drawn: a function, or the ends of the interval of a uniform distribution.
-Draw = Callable[[Plan, np.random.Generator], Any] | tuple[float, float]
+Draw = Callable[[Plan, np.random.Generator], object] | tuple[float, float]
 
 # Groups: effects that the gap library also contains, by the same names; effects that it lacks, for its calibration
 # and for tests.
@@ -156,7 +157,7 @@ class Effect:
 
     kind: EffectKind
     strength: float
-    parameters: Mapping[str, Any]
+    parameters: Mapping[str, object]
 
     def __getitem__(self, name: str) -> Any:
         """The parameter with this name."""
@@ -166,7 +167,7 @@ class Effect:
         """The same effect with another strength."""
         return replace(self, strength=strength)
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, object]:
         """The effect for the truth of a case. cause: its name in the gap library; None if the library does not
         contain it.
         """
@@ -183,7 +184,7 @@ class Effect:
         }
 
 
-def apply_effects(effects: Sequence[Effect], step: str, value: Any, *beside: Any) -> Any:
+def apply_effects(effects: Sequence[Effect], step: str, value: Value, *beside: object) -> Value:
     """The value after a step of the simulation: every effect that acts on this step changes it."""
     for effect in effects:
         if effect.kind.step == step and effect.strength:

@@ -25,7 +25,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from enum import IntFlag
 from functools import partial
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,7 +107,7 @@ class Changes:
     ranges: tuple[Range, ...]
     artefacts: Artefacts
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, object]:
         """Values for JSON, without the plane of suspected pixels."""
         plain = {name: value for name, value in vars(self).items() if name not in ("structures", "ranges")}
         return plain | {
@@ -277,7 +277,7 @@ def _structure(blocks: _Blocks, old: Means, new: Means, kind: str, tail: float) 
         tail_pct=tail,
         blocks=before.size,
         before=float(before.mean()),
-        sum_pct=float(_change_pct(before.sum(), after.sum())),
+        sum_pct=_change_pct(before.sum(keepdims=True), after.sum(keepdims=True)).item(),
         median_pct=float(np.median(change)),
         up_to_pct=float(np.percentile(change, _LARGEST_PCT if bright else 100 - _LARGEST_PCT)),
     )
@@ -325,7 +325,7 @@ def _percentiles(
     return {f"p{level:g}": float(value) for level, value in zip(CHANGE_PERCENTILES, levels, strict=True)}
 
 
-def _change_pct(before: Any, after: Any) -> Any:
+def _change_pct(before: Plane, after: Plane) -> Plane:
     change = np.asarray(after / before)  # Eq. (1)
     change -= 1
     change *= 100

@@ -180,7 +180,7 @@ class Treated:
                 return {"sum_pct": row["sum_pct"], "up_to_pct": row["up_to_pct"]}
         return None
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, object]:
         """One row of the table, as JSON values."""
         return {
             "file": self.name,
@@ -255,7 +255,7 @@ def treat_many(
     return sorted(treated, key=lambda row: -row.score), failures
 
 
-def table(treated: Sequence[Treated], failures: Sequence[Failure]) -> dict[str, Any]:
+def table(treated: Sequence[Treated], failures: Sequence[Failure]) -> dict[str, object]:
     """The results as JSON values: a summary, one row per image in the order of `treated`, and the failures."""
     return {
         "schema": "effects/1",
@@ -361,11 +361,11 @@ def _short(name: str) -> str:
     return file if len(file) <= _LETTERS else f"{file[: _LETTERS // 2 - 2]}...{file[-_LETTERS // 2 :]}"
 
 
-def _summary(treated: Sequence[Treated], failures: Sequence[Failure]) -> dict[str, Any]:
+def _summary(treated: Sequence[Treated], failures: Sequence[Failure]) -> dict[str, object]:
     """Summary of all images: the number of images that a person should inspect, and medians and extremes of the
     changes.
     """
-    out: dict[str, Any] = {
+    out: dict[str, object] = {
         "images": len(treated),
         "failures": len(failures),
         "to_look_at": sum(row.score >= LOOK_FROM for row in treated),

@@ -20,7 +20,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 from weakref import WeakValueDictionary
 
 from psfcore.errors import DataError
@@ -121,7 +121,9 @@ def decode_plane(path: str | Path, name: str, limits: FitsLimits, target: Binary
     return Decoded(shape, answer["unit"])
 
 
-def write_pixels(target: BinaryIO, *, path: str, hdu: int | None, limits: dict[str, int]) -> dict[str, Any]:
+def write_pixels(
+    target: BinaryIO, *, path: str, hdu: int | None, limits: dict[str, int]
+) -> dict[str, object]:
     """Write the pixels of an image to ``target`` as little-endian float32; returns its unit. Call it in a limited
     process.
     """

@@ -91,7 +91,7 @@ def write_cutout(path: str | Path, region: Region, limits: FitsLimits, target: B
     )
 
 
-def cut_out(target: BinaryIO, *, path: str, frame: Frame, edge: list[list[float]]) -> dict[str, Any]:
+def cut_out(target: BinaryIO, *, path: str, frame: Frame, edge: list[list[float]]) -> dict[str, object]:
     """Write the cut-out of a product to ``target``. Call it in a limited process (`psfcore.limited`)."""
     with readable_pixels(path, "the region"), fits.open(path, memmap=False) as hdus:
         image = hdus[0]
@@ -161,6 +161,6 @@ def moved_header(whole: fits.Header, columns: slice, rows: slice) -> fits.Header
     return header
 
 
-def _cut(hdu: Any, columns: slice, rows: slice) -> Any:
+def _cut(hdu: fits.ImageHDU, columns: slice, rows: slice) -> Any:
     make = fits.PrimaryHDU if isinstance(hdu, fits.PrimaryHDU) else fits.ImageHDU
     return make(np.asarray(hdu.section[rows, columns]), moved_header(hdu.header, columns, rows))

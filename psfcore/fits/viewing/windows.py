@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.arrays import Number
 from psfcore.errors import DataError
 from psfcore.fits.viewing.planes import PIXEL_BYTES, Plane
 
@@ -112,6 +112,6 @@ def _union(pieces: Iterator[NDArray[np.float32]], step: int) -> NDArray[np.int64
     return union
 
 
-def _summed(piece: NDArray[Any], sum_of: np.ufunc, step: int) -> NDArray[Any]:
+def _summed(piece: NDArray[Number], sum_of: np.ufunc, step: int) -> NDArray[Number]:
     rows, columns = (np.arange(0, size, step) for size in piece.shape)
     return sum_of.reduceat(sum_of.reduceat(piece, rows, axis=0), columns, axis=1)

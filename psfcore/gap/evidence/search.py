@@ -30,13 +30,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from psfcore.arrays import Matrix, Vector, cut
+from psfcore.arrays import Matrix, Number, Vector, cut
 from psfcore.convolution.convolver import correlations
 from psfcore.gap.evidence.cells import cells_of, coarse_kernel, sensitivities, whitening
 from psfcore.gap.evidence.linear_model import FLOOR
@@ -294,6 +293,6 @@ def _at_displacements(plane: Matrix, image: Matrix) -> Matrix:
     return np.asarray(_sums(plane[None], image, max(plane.shape) - 2)[0])
 
 
-def displaced(plane: Any, dx: int, dy: int) -> Any:
+def displaced(plane: NDArray[Number], dx: int, dy: int) -> NDArray[Number]:
     """A plane [y, x], moved by whole pixels. Pixels to which no pixel of the plane moves are 0."""
     return cut(plane, -dy, -dx, plane.shape)

@@ -7,7 +7,6 @@ are those that the verdict names as the cause of the gap ("answer" in the report
 from __future__ import annotations
 
 import sys
-from typing import Any
 
 from psfcore.drawing.numbers import DASH, with_error
 from psfcore.drawing.page import Page, render
@@ -25,11 +24,11 @@ from psfcore.gap.report.report import (
     unit_words,
     words,
 )
+from psfcore.gap.schema import GapReport, IntervalJson
 from psfcore.gap.verdict.answer import UNKNOWN
 from psfcore.gap.verdict.axes import SIGN_FLIPS, SIGNIFICANT
 from psfcore.gap.verdict.correction import ROUNDS
 
-Report = dict[str, Any]
 Row = list[str]
 
 VERDICTS = {
@@ -42,7 +41,7 @@ VERDICTS = {
 MOST_HYPOTHESES = 8
 
 
-def gap_page(found: Diagnosis, report: Report) -> Page:
+def gap_page(found: Diagnosis, report: GapReport) -> Page:
     """The page of a diagnosis. report: its report (schema gap/3).
 
     The optional entry "provenance" of the report states the software, the libraries, the seed and the PSF at which the
@@ -70,13 +69,13 @@ def gap_page(found: Diagnosis, report: Report) -> Page:
     )
 
 
-def interval_words(interval: dict[str, Any]) -> str:
+def interval_words(interval: IntervalJson) -> str:
     """A value with its 90 % interval, "5.1 (4.4 to 5.9)"."""
     value, low, high = (round(one, 1) + 0.0 for one in (interval["value"], *interval["ci90"]))
     return f"{value:.1f} ({low:.1f} to {high:.1f})"
 
 
-def names_of_answer(report: Report) -> tuple[str, str, str]:
+def names_of_answer(report: GapReport) -> tuple[str, str, str]:
     """What the named effects are (sure, tied, or the most probable ones), their names, and what each of them does."""
     kind = {"tie": "tied effects", "inconclusive": "most probable effects"}.get(
         report["verdict"], "named effects"
@@ -95,7 +94,7 @@ def names_of_answer(report: Report) -> tuple[str, str, str]:
     )
 
 
-def order_of_axes(report: Report) -> str:
+def order_of_axes(report: GapReport) -> str:
     """Why the first axis comes first, if another one has a larger share; else empty."""
     first, *others = report["where"]
     if not any(one["share"] > first["share"] for one in others):
@@ -108,7 +107,7 @@ def order_of_axes(report: Report) -> str:
     return f"The first axis does not have the largest share: it is first because {why}."
 
 
-def cause_rows(report: Report) -> list[Row]:
+def cause_rows(report: GapReport) -> list[Row]:
     """Every alternative of every cause of the answer."""
     return [
         [
@@ -123,7 +122,7 @@ def cause_rows(report: Report) -> list[Row]:
     ]
 
 
-def hypothesis_rows(report: Report) -> list[Row]:
+def hypothesis_rows(report: GapReport) -> list[Row]:
     """The most probable hypotheses."""
     return [
         [
@@ -135,11 +134,11 @@ def hypothesis_rows(report: Report) -> list[Row]:
     ]
 
 
-def effect_rows(report: Report) -> list[Row]:
+def effect_rows(report: GapReport) -> list[Row]:
     """Every effect that was tested, with its parameters and its closure."""
     rows = []
     for effect in fits_of(report):
-        parameters, fall, closure = (effect[key] for key in ("parameters", "delta_chi2_held_out", "closure"))
+        parameters, fall, closure = effect["parameters"], effect["delta_chi2_held_out"], effect["closure"]
         numbers = (
             f"{words(name)} {with_error(p['value'], p['sigma'])} {unit_words(p['unit'])}".rstrip()
             for name, p in parameters.items()
@@ -154,7 +153,7 @@ def effect_rows(report: Report) -> list[Row]:
     return rows
 
 
-def psf_table(found: Diagnosis, report: Report) -> tuple[Row, list[Row]]:
+def psf_table(found: Diagnosis, report: GapReport) -> tuple[Row, list[Row]]:
     """The parameters and 1 - encircled energy of the PSF, without and with the named effects."""
     fits = [one for one in (report["psf"]["refitted"], report["psf"]["with_answer"]) if one is not None]
     rows = []
@@ -179,12 +178,12 @@ def _compared(values: list[tuple[float, float]]) -> Row:
     return cells
 
 
-def untestable_rows(report: Report) -> list[Row]:
+def untestable_rows(report: GapReport) -> list[Row]:
     """The effects that these data cannot show, with the reasons."""
     return [[words(one["name"]), one["why"]] for one in report["untestable"]]
 
 
-def image_rows(report: Report) -> list[Row]:
+def image_rows(report: GapReport) -> list[Row]:
     """All images that the fit used."""
     return [
         [

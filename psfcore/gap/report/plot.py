@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import itertools
 import textwrap
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Concatenate, ParamSpec
 
 import numpy as np
-from matplotlib.figure import Figure
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Wedge
 
@@ -23,8 +24,9 @@ from psfcore.drawing.plots import CHANGE, INK, png_of, tidy
 from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.evidence.cells import RINGS, DiscCells
 from psfcore.gap.report.report import fits_of, percent_words
+from psfcore.gap.schema import FieldJson, FitJson, GapReport, IntervalJson
 
-Report = dict[str, Any]
+P = ParamSpec("P")
 
 WIDTH_IN = 9.9
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#8a6d00", "#56B4E9")
@@ -44,27 +46,33 @@ _TITLES = ("Fitted model", "With the told causes")
 _CELLS = [(low, high, k, sectors) for low, high, sectors in RINGS for k in range(sectors)]
 
 
-def _png(width_in: float, height_in: float, draw: Callable[..., None], *data: Any) -> bytes:
+def _png(
+    width_in: float,
+    height_in: float,
+    draw: Callable[Concatenate[Figure, P], None],
+    *data: P.args,
+    **named: P.kwargs,
+) -> bytes:
     """The figure of `draw` as PNG. data: the arguments of `draw` after the figure."""
     figure = Figure(figsize=(width_in, height_in), dpi=PLOT_DPI, facecolor="white", layout="constrained")
-    draw(figure, *data)
+    draw(figure, *data, **named)
     return png_of(figure)
 
 
-def _panels(figure: Any, after: bool, **how: Any) -> list[Any]:
+def _panels(figure: Figure | SubFigure, after: bool, *, sharey: bool = False) -> list[Axes]:
     """Charts of the fitted model and, if `after`, of the model with the named effects."""
-    charts = list(np.ravel(figure.subplots(1, 1 + after, squeeze=False, **how)))
+    charts = list(np.ravel(figure.subplots(1, 1 + after, squeeze=False, sharey=sharey)))
     for axes, title in zip(charts, _TITLES, strict=False):
         axes.set_title(title, fontsize=11)
     return charts
 
 
-def residuals_png(report: Report) -> bytes:
+def residuals_png(report: GapReport) -> bytes:
     """Residuals of the discs' means against detector x, y and time, without and with the named effects."""
     return _png(WIDTH_IN, 3.7, draw_residuals, report)
 
 
-def draw_residuals(figure: Any, report: Report) -> None:
+def draw_residuals(figure: Figure | SubFigure, report: GapReport) -> None:
     """Draw the residuals on three charts, and one legend on the figure."""
     charts = list(figure.subplots(1, 3, sharey=True))
     rows = report["images"]
@@ -74,27 +82,37 @@ def draw_residuals(figure: Any, report: Report) -> None:
         ("Detector y of the disc (px)", _column(rows, "y_px")),
         ("Time from the first image (min)", _column(rows, "time_s") / 60),
     )
-    hollow: dict[str, Any] = {"mfc": "white", "mew": 1.2}
     for axes, (label, at) in zip(charts, along, strict=True):
         axes.axhline(0, color="#555555", linewidth=1.0)
         for here, colour, symbol in looks.values():
-            for what, more in (
-                ("", {"ms": 5, "elinewidth": 1.1, "mew": 0}),
-                ("after_", {"ms": 4.5, "elinewidth": 0.5, **hollow}),
-            ):
+            for what, face, ms, mew, bar in (("", colour, 5.0, 0.0, 1.1), ("after_", "white", 4.5, 1.2, 0.5)):
                 residual, noise = (_column(rows, f"{name}_{what}pct") for name in ("residual", "noise"))
-                axes.errorbar(at[here], residual[here], noise[here], fmt=symbol, color=colour, **more)
+                axes.errorbar(
+                    at[here],
+                    residual[here],
+                    noise[here],
+                    fmt=symbol,
+                    color=colour,
+                    mfc=face,
+                    ms=ms,
+                    mew=mew,
+                    elinewidth=bar,
+                )
         axes.set(xlabel=label)
     charts[0].set(ylabel="Simulated - observed (%)")
-    entries: list[dict[str, Any]] = [
-        {"label": f"pointing {fov}", "color": colour, "marker": symbol}
+    entries = [
+        Line2D([], [], ls="none", ms=6, label=f"pointing {fov}", color=colour, marker=symbol)
         for fov, (_, colour, symbol) in looks.items()
     ]
     if has_after(report):
-        both = [{"label": title.lower(), "color": "#555555", "marker": "o"} for title in _TITLES]
-        entries += [both[0], both[1] | hollow]
+        full, hollow = (
+            Line2D([], [], ls="none", ms=6, label=title.lower(), color="#555555", marker="o")
+            for title in _TITLES
+        )
+        hollow.set(mfc="white", mew=1.2)
+        entries += [full, hollow]
     figure.legend(
-        handles=[Line2D([], [], ls="none", ms=6, **style) for style in entries],
+        handles=entries,
         loc="outside upper center",
         ncols=8,
         fontsize=9,
@@ -105,12 +123,12 @@ def draw_residuals(figure: Any, report: Report) -> None:
     tidy(charts)
 
 
-def map_png(report: Report) -> bytes:
+def map_png(report: GapReport) -> bytes:
     """Every disc at its position on the detector. The colour shows its residual, without and with the named effects."""
     return _png(4.95 * (1 + has_after(report)) + 0.6, 4.6, draw_map, report)
 
 
-def draw_map(figure: Any, report: Report) -> None:
+def draw_map(figure: Figure | SubFigure, report: GapReport) -> None:
     """Draw the residual of each image at the position of its disc on the detector.
 
     First chart: the fitted model without effects. Second chart, if there are residuals with the named effects: the
@@ -139,16 +157,17 @@ def draw_map(figure: Any, report: Report) -> None:
         axes.set(xlim=(-0.5, nx - 0.5), ylim=(-0.5, ny - 0.5), aspect="equal", xlabel="Detector x (px)")
     charts[0].set(ylabel="Detector y (px)")
     charts[0].legend(fontsize=8.5, loc="best", framealpha=0.85, edgecolor="none")
+    assert drawn is not None  # every report has a chart and a pointing
     figure.colorbar(drawn, ax=charts, label="Simulated - observed (%)", shrink=0.85)
     tidy(charts)
 
 
-def unocculted_png(report: Report) -> bytes:
+def unocculted_png(report: GapReport) -> bytes:
     """The residual of the unocculted field of each image against time, without and with the named effects."""
     return _png(WIDTH_IN, 3.4, lambda figure: draw_unocculted(figure.subplots(), report))
 
 
-def draw_unocculted(axes: Any, report: Report) -> None:
+def draw_unocculted(axes: Axes, report: GapReport) -> None:
     """Draw the residual of the blocks of each image, in units of the noise. Full symbols: the fitted model. Open
     symbols: the model with the named effects.
     """
@@ -165,7 +184,7 @@ def draw_unocculted(axes: Any, report: Report) -> None:
     tidy([axes])
 
 
-def field_png(report: Report) -> bytes:
+def field_png(report: GapReport) -> bytes:
     """The first cause that has a shape: a map of the detector with its errors, or a curve."""
     field = field_of(report)
     assert field is not None
@@ -174,12 +193,12 @@ def field_png(report: Report) -> bytes:
     return _png(*size, draw, report, field, label)
 
 
-def field_of(report: Report) -> Report | None:
+def field_of(report: GapReport) -> FieldJson | None:
     """The field of the first cause that has one; None if there is none."""
     return next((cause["field"] for cause in report["causes"] if cause["field"] is not None), None)
 
 
-def _draw_curve(figure: Any, report: Report, field: Report, label: str) -> None:
+def _draw_curve(figure: Figure | SubFigure, report: GapReport, field: FieldJson, label: str) -> None:
     at, values, sigma = field["curve"].values()
     along = ("Radius in the PSF (px)", "log") if "radius_px" in field["curve"] else ("Time (s)", "linear")
     axes = figure.subplots()
@@ -189,7 +208,7 @@ def _draw_curve(figure: Any, report: Report, field: Report, label: str) -> None:
     tidy([axes])
 
 
-def _draw_field(figure: Any, report: Report, field: Report, label: str) -> None:
+def _draw_field(figure: Figure | SubFigure, report: GapReport, field: FieldJson, label: str) -> None:
     values, sigma = (np.array(field["map"][name]) for name in ("value", "sigma"))
     charts, clearest = figure.subplots(1, 2), abs(field["strength"]["value"])
     ny, nx = report["shape"]
@@ -211,7 +230,7 @@ def cells_png(found: Diagnosis) -> bytes:
     return _png(4.2 * (1 + bool(found.corrected)) + 0.9, 4.2, draw_cells, found)
 
 
-def draw_cells(figure: Any, found: Diagnosis) -> None:
+def draw_cells(figure: Figure | SubFigure, found: Diagnosis) -> None:
     """Draw each cell as a sector of a ring. The second chart, if effects are named, shows the model with the named
     effects.
     """
@@ -283,12 +302,12 @@ def _numbers(disc: DiscCells) -> list[int]:
     return out
 
 
-def where_png(report: Report) -> bytes:
+def where_png(report: GapReport) -> bytes:
     """The share of the gap along each axis."""
     return _png(7.4, 0.9 + 0.32 * len(report["where"]), lambda figure: draw_where(figure.subplots(), report))
 
 
-def effects_png(report: Report) -> bytes:
+def effects_png(report: GapReport) -> bytes:
     """The closure by each effect on held-out images, best effect first."""
     height_in = 1.1 + 0.34 * min(len(fits_of(report)), MOST_EFFECTS)
     return _png(WIDTH_IN, height_in, lambda figure: draw_effects(figure.subplots(), report))
@@ -301,7 +320,7 @@ def slices_png(found: Diagnosis) -> bytes:
     return _png(4.95 * (1 + bool(found.corrected)) + 0.1, 3.7, _draw_slices, found)
 
 
-def _draw_slices(figure: Any, found: Diagnosis) -> None:
+def _draw_slices(figure: Figure | SubFigure, found: Diagnosis) -> None:
     charts, n = _panels(figure, bool(found.corrected), sharey=True), largest_residual(found)
     transit, sky = found.solution.transit, found.solution.sky
     frame, centre, (rows, columns) = transit.frames[n], sky.found[n].place.x_px, sky.dark[n]
@@ -348,17 +367,17 @@ def simulated_of(found: Diagnosis, n: int, *, with_answer: bool = False) -> Plan
     return np.asarray(seen, np.float64) + (raw - solution.transit.frames[n].pixels)
 
 
-def gap_png(found: Diagnosis, report: Report) -> bytes:
+def gap_png(found: Diagnosis, report: GapReport) -> bytes:
     """The figure of `gap_figure` as PNG."""
     return png_of(gap_figure(found, report))
 
 
-def gap_figure(found: Diagnosis, report: Report) -> Figure:
+def gap_figure(found: Diagnosis, report: GapReport) -> Figure:
     """All figures as one figure, below the summary sentence."""
     figure = Figure(figsize=(15.0, 13.2), dpi=100, facecolor="white", layout="constrained")
     words = "\n".join("\n".join(textwrap.wrap(line, 165)) for line in report["lines"])
     figure.suptitle(words, fontsize=12.5, color=INK, x=0.012, ha="left", linespacing=1.4)
-    bands: Any = figure.subfigures(3, 1, height_ratios=(1.0, 1.05, 1.1))
+    bands = figure.subfigures(3, 1, squeeze=False, height_ratios=(1.0, 1.05, 1.1))[:, 0]
     draw_residuals(bands[0], report)
     left, right = bands[1].subfigures(1, 2, width_ratios=(1.25, 1.0))
     draw_map(left, report)
@@ -369,17 +388,17 @@ def gap_figure(found: Diagnosis, report: Report) -> Figure:
     return figure
 
 
-def has_after(report: Report) -> bool:
+def has_after(report: GapReport) -> bool:
     """Whether the report has residuals of the model with the named effects."""
     return any(row["residual_after_pct"] is not None for row in report["images"])
 
 
-def _column(rows: Sequence[dict[str, Any]], name: str) -> Vector:
+def _column(rows: Sequence[Mapping[str, float | None]], name: str) -> Vector:
     """One number of every image (images,); NaN if the number is missing."""
     return np.array([np.nan if row[name] is None else row[name] for row in rows], dtype=np.float64)
 
 
-def _looks(rows: Sequence[dict[str, Any]]) -> dict[int, tuple[Flags, str, str]]:
+def _looks(rows: Sequence[Mapping[str, float | None]]) -> dict[int, tuple[Flags, str, str]]:
     """For each pointing: which images belong to it (images,), its colour and its symbol."""
     pointing = _column(rows, "fov")
     looks = itertools.cycle(zip(_COLOURS, _SYMBOLS, strict=True))
@@ -389,7 +408,7 @@ def _looks(rows: Sequence[dict[str, Any]]) -> dict[int, tuple[Flags, str, str]]:
 # --- bars -------------------------------------------------------------------------------------------------
 
 
-def draw_where(axes: Any, report: Report) -> None:
+def draw_where(axes: Axes, report: GapReport) -> None:
     """Draw one horizontal bar for each axis, with its p-value. The axes are in the order of the report; the first is at
     the top.
     """
@@ -406,7 +425,7 @@ def draw_where(axes: Any, report: Report) -> None:
     tidy([axes])
 
 
-def draw_effects(axes: Any, report: Report) -> None:
+def draw_effects(axes: Axes, report: GapReport) -> None:
     """Draw the closure by each effect, with its 90 % interval and its probability. The named or tied effects are
     blue.
     """
@@ -427,7 +446,7 @@ def draw_effects(axes: Any, report: Report) -> None:
     tidy([axes])
 
 
-def _chosen(row: Report, report: Report) -> bool:
+def _chosen(row: FitJson, report: GapReport) -> bool:
     """Whether a row of the report is the fit of the named effects. For a tie: whether it is the fit of a tied
     hypothesis.
     """
@@ -435,7 +454,7 @@ def _chosen(row: Report, report: Report) -> bool:
     return names == set(report["answer"]) or (report["verdict"] == "tie" and names <= set(report["answer"]))
 
 
-def _draw_closure(axes: Any, y: float, closure: dict[str, Any] | None, colour: str) -> None:
+def _draw_closure(axes: Axes, y: float, closure: IntervalJson | None, colour: str) -> None:
     if closure is None:
         axes.text(0.02, y, "no gap to close", va="center", fontsize=8.5, color="#666666")
         return

@@ -20,6 +20,7 @@ from psfcore.gap.diagnose import Diagnosis, Shrinking
 from psfcore.gap.evidence.columns import FieldShape, another
 from psfcore.gap.evidence.effect_fits import EffectFit, left_chi2
 from psfcore.gap.evidence.tree import FAMILIES, SUN, family_of, listed
+from psfcore.gap.schema import CauseJson, FieldJson, FitJson, GapReport, IntervalJson, ParameterJson
 from psfcore.gap.verdict.answer import LEAST_IMAGES, Alternative, Cause
 from psfcore.gap.verdict.axes import SIGNIFICANT, Axis
 from psfcore.gap.verdict.closure import HeldOut, Interval
@@ -50,7 +51,7 @@ AXIS_WORDS = {
 }
 
 
-def gap_report(found: Diagnosis) -> dict[str, Any]:
+def gap_report(found: Diagnosis) -> GapReport:
     """The report of a diagnosis, schema gap/3."""
     answer, stated, lines = found.answer, found.limits.as_json(), three_lines(found)
     several = found.told is not None and found.told.label not in found.fits
@@ -72,7 +73,7 @@ def gap_report(found: Diagnosis) -> dict[str, Any]:
         "answer": list(answer.named),
         "level": answer.level,
         "causes": [_cause(found, cause) for cause in answer.causes],
-        "closure": found.shrinking_of_told and _interval(found.shrinking_of_told.closure),
+        "closure": None if found.shrinking_of_told is None else _interval(found.shrinking_of_told.closure),
         "would_separate": would_separate(found),
         "would_confirm": would_confirm(found),
         "hypotheses": [
@@ -99,8 +100,9 @@ def gap_report(found: Diagnosis) -> dict[str, Any]:
         "psf": {
             "shape": found.solution.inversion.shape.name,
             "refitted": _values(found.solution.inversion, found.model.base.covariance),
-            "with_answer": found.corrected
-            and _values(found.corrected.solution.inversion, found.corrected.covariance),
+            "with_answer": None
+            if found.corrected is None
+            else _values(found.corrected.solution.inversion, found.corrected.covariance),
         },
         "shape": list(found.solution.transit.shape),
         "images": _images(found),
@@ -117,7 +119,7 @@ def _probabilities(found: Diagnosis) -> dict[str, float]:
     }
 
 
-def _cause(found: Diagnosis, cause: Cause) -> dict[str, Any]:
+def _cause(found: Diagnosis, cause: Cause) -> CauseJson:
     """One cause of the answer, as JSON."""
     first = cause.alternatives[0]
     shape = found.shapes.get(first.family.name)
@@ -140,10 +142,10 @@ def _cause(found: Diagnosis, cause: Cause) -> dict[str, Any]:
     }
 
 
-def _shape(shape: FieldShape, of: Alternative) -> dict[str, Any]:
+def _shape(shape: FieldShape, of: Alternative) -> FieldJson:
     """The map or the curve of a field, as JSON."""
     k = shape.clearest
-    told = {
+    told: FieldJson = {
         "words": of.family.words,
         "unit": shape.unit,
         "strength": {"value": float(shape.values[k]), "sigma": float(shape.sigma[k])},
@@ -151,21 +153,24 @@ def _shape(shape: FieldShape, of: Alternative) -> dict[str, Any]:
     if shape.axes == ("x_px", "y_px"):
         x_px, y_px = (np.unique(along) for along in shape.at.T)
         values, sigma = (part.reshape(y_px.size, x_px.size).tolist() for part in (shape.values, shape.sigma))
-        return told | {"map": {"x_px": x_px.tolist(), "y_px": y_px.tolist(), "value": values, "sigma": sigma}}
+        return {
+            **told,
+            "map": {"x_px": x_px.tolist(), "y_px": y_px.tolist(), "value": values, "sigma": sigma},
+        }
     at = {shape.axes[0]: shape.at[:, 0].tolist()}
-    return told | {"curve": at | {"value": shape.values.tolist(), "sigma": shape.sigma.tolist()}}
+    return {**told, "curve": at | {"value": shape.values.tolist(), "sigma": shape.sigma.tolist()}}
 
 
-def fits_of(report: dict[str, Any]) -> list[dict[str, Any]]:
+def fits_of(report: GapReport) -> list[FitJson]:
     """All fits of a report, in the order of display: first the told causes together, then single effects."""
     return [*report["together"], *report["effects"]]
 
 
-def _interval(interval: Interval | None) -> dict[str, Any] | None:
+def _interval(interval: Interval | None) -> IntervalJson | None:
     return None if interval is None else interval.to_json()
 
 
-def _values(inversion: Inversion, covariance: NDArray[np.float64]) -> dict[str, Any]:
+def _values(inversion: Inversion, covariance: NDArray[np.float64]) -> dict[str, ParameterJson]:
     """The parameters of the shape, with errors that contain the floor of the linear model.
 
     covariance: the covariance of the coordinates, from the linear model.
@@ -181,7 +186,7 @@ def _values(inversion: Inversion, covariance: NDArray[np.float64]) -> dict[str, 
     }
 
 
-def _fit(found: Diagnosis, fit: EffectFit, shrinking: Shrinking | None) -> dict[str, Any]:
+def _fit(found: Diagnosis, fit: EffectFit, shrinking: Shrinking | None) -> FitJson:
     """The fit of one or several causes, with the parameters of their full refit if there is one."""
     refit = found.corrected if found.corrected is not None and found.corrected.label == fit.label else None
     causes = {effect.name: effect.cause for effect in fit.model.evidence.effects}
@@ -196,9 +201,9 @@ def _fit(found: Diagnosis, fit: EffectFit, shrinking: Shrinking | None) -> dict[
         },
         "p_value": fit.p_value,
         "delta_chi2": fit.gain,
-        "delta_chi2_held_out": shrinking and shrinking.held_out_fall,
-        "closure": shrinking and _interval(shrinking.closure),
-        "closure_by_pointing": shrinking and _interval(shrinking.closure_by_pointing),
+        "delta_chi2_held_out": None if shrinking is None else shrinking.held_out_fall,
+        "closure": None if shrinking is None else _interval(shrinking.closure),
+        "closure_by_pointing": None if shrinking is None else _interval(shrinking.closure_by_pointing),
         "refitted": refit is not None,
         "cause": " ".join(causes[name] for name in fit.names),
     }

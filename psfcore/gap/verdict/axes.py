@@ -17,7 +17,6 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.special import chdtrc
@@ -26,6 +25,7 @@ from psfcore.arrays import Matrix, Vector
 from psfcore.gap.evidence.cells import DiscCells
 from psfcore.gap.evidence.linear_model import LinearModel, Step
 from psfcore.gap.evidence.responses import Evidence, ImageInfo
+from psfcore.gap.schema import AxisJson
 
 SIGN_FLIPS = 999
 # an axis of the best effect comes first if it explains at least this fraction of what the best axis explains
@@ -47,10 +47,10 @@ class Axis:
     share: float
     p_value: float
     alone: float
-    at: dict[str, Any]
+    at: dict[str, list[int] | list[float]]
     of_best: bool = False
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> AxisJson:
         """The axis as JSON, for the gap report."""
         return {
             "axis": self.name,
@@ -227,14 +227,14 @@ def shapley(names: list[str], worth: dict[tuple[str, ...], float]) -> dict[str, 
     return out
 
 
-def _at(model: LinearModel, name: str) -> dict[str, Any]:
+def _at(model: LinearModel, name: str) -> dict[str, list[int] | list[float]]:
     """The pointings with the largest residuals, and the range of the axis in these pointings."""
     discs, taken = model.evidence.discs, [model.evidence.image_info[n] for n in model.evidence.images]
     excess = np.array([float(r @ r) - r.size for r in model.left(model.base)])
     pointing = np.array([info.pointing for info in taken])
     by_pointing = {int(one): float(excess[pointing == one].sum()) for one in np.unique(pointing)}
     strongest = sorted(by_pointing, key=lambda one: -by_pointing[one])[:SUSPECT]
-    out: dict[str, Any] = {"pointings": sorted(strongest)}
+    out: dict[str, list[int] | list[float]] = {"pointings": sorted(strongest)}
     values = _along(discs, taken).get(name)
     if values is not None and name not in ("pointing", "gain_mode"):
         here = values[np.isin(pointing, strongest)]

@@ -21,7 +21,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
-from typing import Any
 
 from psfcore.errors import DataError
 
@@ -30,7 +29,7 @@ MOST = 0.99
 FILE = "calibration.json"
 # How many causes the answers covered in a blind set whose effects another author wrote: the row "10 % left: an entry
 # covers the cause" of the results in docs/gap.md, with its 95 % interval.
-ANOTHER_AUTHOR: Mapping[str, Any] = {"causes": 19, "left_pct": 10, "covered": 0.684, "ci95": [0.46, 0.846]}
+ANOTHER_AUTHOR: Mapping[str, object] = {"causes": 19, "left_pct": 10, "covered": 0.684, "ci95": [0.46, 0.846]}
 
 
 @dataclass(frozen=True)
@@ -41,7 +40,7 @@ class Calibration:
     """
 
     levels: tuple[float, ...]
-    about: Mapping[str, Any]
+    about: Mapping[str, object]
 
     def level(self, coverage: float = COVERAGE) -> float:
         """The level of a group of alternatives, Eq. (1). Raises DataError "bad-coverage" if there are too few cases."""
@@ -60,7 +59,7 @@ class Calibration:
         """The fraction of the simulated cases whose answer contains a true cause at this level."""
         return sum(one <= level for one in self.levels) / len(self.levels)
 
-    def to_json(self, level: float) -> dict[str, Any]:
+    def to_json(self, level: float) -> dict[str, object]:
         """For the gap report: how many cases, what they gave at this level, how they were made, and what the effects of
         another author gave.
         """

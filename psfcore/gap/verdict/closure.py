@@ -31,13 +31,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from psfcore.arrays import Vector
 from psfcore.gap.evidence.linear_model import LinearModel
+from psfcore.gap.schema import IntervalJson
 from psfcore.transit.transit import Fold, folds
 
 RESAMPLES = 1000
@@ -58,7 +58,7 @@ class Interval:
     low: float
     high: float
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> IntervalJson:
         """The value and the interval as JSON, for the gap report."""
         return {"value": self.value, "ci90": [self.low, self.high]}
 
@@ -87,10 +87,8 @@ class HeldOut:
     def of(self, images: Sequence[int]) -> HeldOut:
         """The results for these images only. Deviance and spread are left out, because they belong to folds."""
         here = [self.images.index(image) for image in images]
-        arrays: dict[str, Any] = {
-            name: values[here] for name, values in vars(self).items() if isinstance(values, np.ndarray)
-        }
-        return HeldOut(tuple(images), **arrays)
+        arrays = {name: values[here] for name, values in vars(self).items() if isinstance(values, np.ndarray)}
+        return replace(self, images=tuple(images), deviance={}, spread={}, **arrays)
 
 
 def time_blocks(model: LinearModel) -> tuple[Fold, ...]:

@@ -23,7 +23,6 @@ import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.optimize import brentq
@@ -32,6 +31,7 @@ from scipy.special import logsumexp, ndtr, ndtri
 from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.closed_form import ClosedForm, Form, Variant
 from psfcore.gap.evidence.tree import listed
+from psfcore.gap.schema import EffectLimitsJson, LimitsJson, ParameterLimitsJson
 from psfcore.gap.verdict.answer import FLOOR, NONE, ONE, prior_of
 
 FOUND, EXCLUDED = 0.9, 0.95
@@ -58,10 +58,10 @@ class ParameterLimits:
     found_90: float | None
     excluded_95: float | None
 
-    def as_json(self, *, observed: bool = True) -> dict[str, Any]:
+    def as_json(self, *, observed: bool = True) -> ParameterLimitsJson:
         """The limits for a report. observed: whether there are data, which can exclude strengths."""
-        content = {"unit": self.unit, "found_90": self.found_90}
-        return content | ({"excluded_95": self.excluded_95} if observed else {})
+        content: ParameterLimitsJson = {"unit": self.unit, "found_90": self.found_90}
+        return {**content, "excluded_95": self.excluded_95} if observed else content
 
 
 @dataclass(frozen=True)
@@ -82,13 +82,16 @@ class EffectLimits:
 
         return min(self.parameters, key=multiple)
 
-    def as_json(self, *, observed: bool = True) -> dict[str, Any]:
+    def as_json(self, *, observed: bool = True) -> EffectLimitsJson:
         """The limits of the leading parameter. If the effect has several parameters, the limits of all parameters are
         added.
         """
-        content = {"parameter": self.leading.name} | self.leading.as_json(observed=observed)
-        if len(self.parameters) > 1:
-            content["parameters"] = {one.name: one.as_json(observed=observed) for one in self.parameters}
+        leading, every = self.leading, {p.name: p.as_json(observed=observed) for p in self.parameters}
+        content = EffectLimitsJson(parameter=leading.name, unit=leading.unit, found_90=leading.found_90)
+        if observed:
+            content["excluded_95"] = leading.excluded_95
+        if len(every) > 1:
+            content["parameters"] = every
         return content
 
 
@@ -123,7 +126,7 @@ class Limits:
         own = EffectLimits(tuple(replace(p, excluded_95=new.get(p.name, p.excluded_95)) for p in parameters))
         return replace(self, effects={**self.effects, effect.name: own})
 
-    def as_json(self, *, observed: bool = True) -> dict[str, Any]:
+    def as_json(self, *, observed: bool = True) -> LimitsJson:
         """`limits`, `alike` and `untestable` as in a report. observed: as in `ParameterLimits`."""
         return {
             "limits": {name: one.as_json(observed=observed) for name, one in self.effects.items()},

@@ -39,7 +39,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from pydantic import TypeAdapter
@@ -105,12 +104,12 @@ class FoldFit:
     held_out_pct: dict[int, float]
     shells: FoldShells | None = None
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Plain values."""
         return dict(json_values(self))
 
     @staticmethod
-    def from_json(content: dict[str, Any]) -> FoldFit:
+    def from_json(content: dict[str, object]) -> FoldFit:
         """The fit from the values of `to_json`."""
         return _FOLD_FIT.validate_python(content)
 
@@ -299,7 +298,7 @@ class ShellBands:
         """The excess with the largest ratio of its absolute value to its error."""
         return self.excess(int(np.argmax(np.abs(self.excess_pct[2] / self.excess_sigma))))
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Plain values."""
         return {
             "edges_px": self.edges_px.tolist(),
@@ -315,7 +314,7 @@ class ShellBands:
         }
 
 
-def limits_json(limits: Matrix) -> dict[str, Any]:
+def limits_json(limits: Matrix) -> dict[str, object]:
     """Percentiles at LIMITS by name."""
     return dict(zip(LIMIT_NAMES, limits.tolist(), strict=True))
 
@@ -370,7 +369,7 @@ class Bands:
             "largest_pct": float(np.abs(found).max()),
         }
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Plain values."""
         return {
             "light_beyond_pct": limits_json(self.curve_pct),
