@@ -290,7 +290,9 @@ def test_a_fit_is_drawn(tmp_path: Path) -> None:
     for fit in (whole, dataclasses.replace(fitted(), free=None, solution=one_round)):
         fit_png(fit, tmp_path / "fit.png")
         picture = imread(tmp_path / "fit.png")[..., :3]
-        np.testing.assert_allclose(picture.shape[:2], (1020, 1560), atol=1)  # matplotlib 3.9 cuts, 3.10 rounds
+        np.testing.assert_allclose(
+            picture.shape[:2], (1020, 1560), atol=1
+        )  # matplotlib 3.9 cuts, 3.10 rounds
         assert 0.05 < picture.std() < 0.4
         red.append(int((np.abs(picture - np.array([179, 38, 30]) / 255).max(axis=-1) < 0.02).sum()))
     assert red[0] > red[1] + 300  # the curves of the published recipe
