@@ -32,13 +32,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from psfcore.blind.case_set import BlindSet
 from psfcore.blind.run_set import BOUND_SCHEMA, REPORT_SCHEMA, result_in, run_of
-from psfcore.gap.schema import AlternativeJson, CauseJson, GapReport
+
+Entry = Mapping[str, Any]  # an entry of a report, or one of its alternatives
 
 NAME, FAMILY, STAGE = LEVELS = ("name", "family", "stage")
 HIDDEN, OPEN, ISOLABLE = CLASSES = ("hidden", "open", "isolable")
@@ -99,7 +100,7 @@ class Cause:
             return HIDDEN
         return ISOLABLE if self.bound[NAME if self.is_known else FAMILY] >= ISOLATED else OPEN
 
-    def matches(self, alternative: AlternativeJson, level: str) -> bool:
+    def matches(self, alternative: Entry, level: str) -> bool:
         """Whether an alternative is right at a level."""
         in_family = alternative["family"] in self.effect["families"]
         if level == NAME:
@@ -107,7 +108,7 @@ class Cause:
             return effect == cause if self.is_known else in_family and effect in (None, cause)
         return in_family or (level == STAGE and alternative["stage"] == self.effect["stage"])
 
-    def right_entries(self, level: str) -> list[CauseJson]:
+    def right_entries(self, level: str) -> list[Entry]:
         """The entries of the report that are right at a level."""
         return [
             entry
@@ -117,7 +118,7 @@ class Cause:
         ]
 
     @property
-    def cover(self) -> CauseJson | None:
+    def cover(self) -> Entry | None:
         """The first entry that covers the cause; None if there is none."""
         right = self.right_entries(STAGE)
         for entry in self.case.entries:
@@ -130,19 +131,19 @@ class Cause:
     def is_below_limit(self) -> bool | None:
         """Whether the true strength is at most the excluded_95 of the report; None if the two cannot be compared."""
         parameter = COMPARABLE.get(self.effect["name"])
-        limit = self.case.report.get("limits", {}).get(self.effect["name"])
-        if parameter is None or limit is None:
-            return None
-        own = limit if limit.get("parameter") == parameter else limit.get("parameters", {}).get(parameter)
-        excluded = None if own is None else own.get("excluded_95")
-        return None if excluded is None else bool(abs(self.effect["strength"]) <= excluded)
+        limit = self.case.report.get("limits", {}).get(self.effect["name"], {})
+        own = limit if limit.get("parameter") == parameter else limit.get("parameters", {}).get(parameter, {})
+        excluded = own.get("excluded_95")
+        return (
+            None if parameter is None or excluded is None else bool(abs(self.effect["strength"]) <= excluded)
+        )
 
     @property
     def is_on_axis(self) -> bool | None:
         """Whether the gap of the report varies most along an axis of the effect; None if the case has another cause
         too, or the effect has no axis.
         """
-        strongest = next((axis["axis"] for axis in self.case.report.get("where", [])), None)
+        strongest = (self.case.report.get("where") or [{}])[0].get("axis")
         axes = AXES.get(self.effect["name"])
         return None if axes is None or not self.is_only else strongest in axes
 
@@ -157,16 +158,15 @@ class Cause:
         true = true_closure(self.case.truth)
         if not self.is_only or stated is None or true is None:
             return None
-        low, high = stated["ci90"]
-        return stated["value"], low, high, true
+        return stated["value"], *stated["ci90"], true
 
     @cached_property
     def map(self) -> tuple[float, float] | None:
         """The distance of the peak of the report's map from the true one, in units of half the field, and the
         correlation of the maps; None if the truth or an entry of the right family has no map.
         """
-        fields = [entry.get("field") for entry in self.right_entries(FAMILY)]
-        stated = next((field["map"] for field in fields if field is not None and "map" in field), None)
+        fields = (entry.get("field") or {} for entry in self.right_entries(FAMILY))
+        stated = next((field["map"] for field in fields if "map" in field), None)
         light = self.effect.get("light_map")
         if light is None or stated is None:
             return None
@@ -179,7 +179,7 @@ class Cause:
         correlation = float(np.corrcoef(true, values)[0, 1]) if both_vary else 0.0
         return float(np.hypot(*way)) / (size_px / 2), correlation
 
-    def as_json(self) -> dict[str, object]:
+    def as_json(self) -> dict[str, Any]:
         """The judgement of the cause, as JSON."""
         return {
             **{key: self.effect[key] for key in ("name", "families", "strength", "left_alone_pct")},
@@ -198,7 +198,7 @@ class DiagnosedCase:
 
     number: int
     truth: dict[str, Any]
-    report: GapReport
+    report: dict[str, Any]
     wall_s: float
     bound: dict[str, Any] | None = None
 
@@ -209,7 +209,7 @@ class DiagnosedCase:
         return tuple(Cause(self, *both) for both in zip(self.truth["effects"], bounds, strict=True))
 
     @property
-    def entries(self) -> list[CauseJson]:
+    def entries(self) -> list[Entry]:
         """The entries of the report: the causes that it claims."""
         return list(self.report["causes"])
 
@@ -230,7 +230,7 @@ class DiagnosedCase:
         first, second = (cause.right_entries(FAMILY) for cause in self.causes)
         return any(one is not other for one in first for other in second)
 
-    def as_json(self) -> dict[str, object]:
+    def as_json(self) -> dict[str, Any]:
         """The judgement of the case, as JSON."""
         return {
             "case": self.number,
@@ -268,7 +268,5 @@ def diagnosed_cases(
             failures[number] = (run.error if run else "") or "no complete report"
         else:
             bound = result_in(blind_set.bound(number), BOUND_SCHEMA)
-            cases.append(
-                DiagnosedCase(number, truth, cast("GapReport", report), run.wall_s if run else 0.0, bound)
-            )
+            cases.append(DiagnosedCase(number, truth, report, run.wall_s if run else 0.0, bound))
     return cases, failures
