@@ -232,12 +232,12 @@ def _check_same_telescope(before: Psf, after: Psf) -> None:
 def _same(one: object, other: object, tolerance: float | None) -> bool:
     if (
         tolerance is not None
-        and isinstance(one, int | float)
-        and isinstance(other, int | float)
+        and isinstance(one, int | float | np.floating)
+        and isinstance(other, int | float | np.floating)
         and one
         and other
     ):
-        return abs(one / other - 1) <= tolerance
+        return abs(float(one) / float(other) - 1) <= tolerance
     return one == other
 
 
