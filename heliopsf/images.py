@@ -30,7 +30,7 @@ from heliopsf.parameters import Number, Options, Progress, Steps, noise_of, numb
 from heliopsf.psfs import AnyPsf, Psf, built_psf, given_psf, instrument_named
 from psfcore.deconvolve.camera_noise import measured_noise
 from psfcore.deconvolve.conditions import PreparedPsfs
-from psfcore.deconvolve.declaration import Edges
+from psfcore.deconvolve.declaration import KnownScene
 from psfcore.deconvolve.doubts import input_warnings
 from psfcore.deconvolve.forward import convolve_image
 from psfcore.deconvolve.methods.registry import properties_of
@@ -145,33 +145,16 @@ def deconvolve(
         region_error=number("region_error", given.region_error, units.dimensionless_unscaled),
         threads=cores() if given.threads is None else whole("threads", given.threads, "bad-threads"),
     )
-    scale = given.plate_scale_arcsec
-    if scale is not None:
-        scale = number("plate_scale_arcsec", scale, units.arcsec / units.pix, units.arcsec)
 
     def begin(stage: str, _steps: int) -> Steps | None:
         return reporter(given.progress if stage == DECONVOLVING else given.progress is True, stage)
 
-    source = partial(
-        PsfSource,
-        possible_psfs=partial(possible_on_pixels, threads=work.threads),
-        plate_scale_arcsec=scale,
-        prepared=PreparedPsfs(),
+    of_image = _source_of(
+        psf,
+        plate_scale_arcsec=given.plate_scale_arcsec,
         other_channel=given.other_channel,
+        threads=work.threads,
     )
-    if psf is None:
-        of_image = source(partial(_built_for, threads=work.threads, parts=False))
-    else:
-        instrument = instrument_named(psf)
-        if instrument is None:
-            own = given_psf(psf, threads=work.threads, progress=None)
-            of_image = source(lambda *_: own, key=id(own), kernel_shape=own.kernel.shape)
-        else:
-            of_image = source(
-                lambda _, progress: given_psf(psf, threads=work.threads, progress=progress),
-                key=instrument.name,
-                built=PsfOrigin.of_instrument(instrument),
-            )
 
     def one(image: Any) -> Any:
         box = None if given.region is None else box_of(given.region, image, given.hdu)
@@ -216,7 +199,7 @@ def convolve(
     smap: Any,
     psf: AnyPsf | None = None,
     *,
-    edges: Edges = "zero",
+    edges: KnownScene = "zero",
     full: bool = False,
     hdu: int | None = None,
     plate_scale_arcsec: Number | None = None,
@@ -267,24 +250,16 @@ def convolve(
         With its ``code``, for what may make the PSF wrong for this image.
     """
     count = cores() if threads is None else whole("threads", threads, "bad-threads")
-    scale = plate_scale_arcsec
-    if scale is not None:
-        scale = number("plate_scale_arcsec", scale, units.arcsec / units.pix, units.arcsec)
-    source = partial(
-        PsfSource,
-        possible_psfs=lambda *_: (),
-        plate_scale_arcsec=scale,
-        other_channel=other_channel,
+
+    def begin(stage: str, _steps: int) -> Steps | None:
+        return reporter(progress is True, stage)
+
+    of_image = _source_of(
+        psf, plate_scale_arcsec=plate_scale_arcsec, other_channel=other_channel, threads=count
     )
-    building = reporter(progress is True, BUILDING)
-    if psf is None:
-        of_image = source(partial(_built_for, threads=count, parts=False))
-    else:
-        own = given_psf(psf, threads=count, progress=building)
-        of_image = source(lambda *_: own, key=id(own))
     with on_disk(smap) as there:
         image = image_of(there, saturation=None, hdu=hdu)
-        found = convolve_image(image, of_image, edges=edges, threads=count, begin=lambda *_: building)
+        found = convolve_image(image, of_image, edges=edges, threads=count, begin=begin)
         for code, message in found.warnings.items():
             warnings.warn(DataWarning(code, message), stacklevel=2)
         result = Convolution(**vars(found) | {"psf": Psf.of(found.psf)})
@@ -328,6 +303,35 @@ def psf_for(image: Any, *, threads: int | None = None, progress: Progress = None
     for code, message in input_warnings(psf, _header_only(header), None, channel=channel).items():
         warnings.warn(DataWarning(code, message), stacklevel=2)
     return Psf.of(psf_for_image(psf, header))
+
+
+def _source_of(
+    psf: AnyPsf | None, *, plate_scale_arcsec: Number | None, other_channel: bool, threads: int
+) -> PsfSource:
+    """The PSF that a user gives, or that of the telescope in the header of each image (None). A PSF that must be built
+    is built when it is needed.
+    """
+    scale = plate_scale_arcsec
+    source = partial(
+        PsfSource,
+        possible_psfs=partial(possible_on_pixels, threads=threads),
+        plate_scale_arcsec=None
+        if scale is None
+        else number("plate_scale_arcsec", scale, units.arcsec / units.pix, units.arcsec),
+        prepared=PreparedPsfs(),
+        other_channel=other_channel,
+    )
+    if psf is None:
+        return source(partial(_built_for, threads=threads, parts=False))
+    instrument = instrument_named(psf)
+    if instrument is None:
+        own = given_psf(psf, threads=threads, progress=None)
+        return source(lambda *_: own, key=id(own), kernel_shape=own.kernel.shape)
+    return source(
+        lambda _, progress: given_psf(psf, threads=threads, progress=progress),
+        key=instrument.name,
+        built=PsfOrigin.of_instrument(instrument),
+    )
 
 
 def _built_for(header: Header, progress: Steps | None, *, threads: int, parts: bool) -> Psf:

@@ -35,8 +35,27 @@ if TYPE_CHECKING:
 _REMOVED = re.compile(rf"{STATISTICS}|PSFDOI", re.IGNORECASE)
 
 
+class _BeforeAndAfter(Shown):
+    """A result with an image before and after."""
+
+    def quicklook(self) -> Figure:
+        """Draw the image before and after, and the change.
+
+        Returns
+        -------
+        Figure
+            Three panels.
+
+        Raises
+        ------
+        MissingExtra
+            The extra "plot" is not installed.
+        """
+        return cast("Figure", module_of_extra("heliopsf.plots").before_and_after(self))
+
+
 @dataclass(frozen=True, kw_only=True, repr=False)
-class Deconvolution(Shown, Product):
+class Deconvolution(_BeforeAndAfter, Product):
     """A deconvolved image with its inputs, errors and warnings.
 
     Attributes
@@ -163,24 +182,9 @@ class Deconvolution(Shown, Product):
         """
         return cast("Axes", module_of_extra("heliopsf.plots").draw_change(self, axes))
 
-    def quicklook(self) -> Figure:
-        """Draw the image before and after, and the change.
-
-        Returns
-        -------
-        Figure
-            Three panels.
-
-        Raises
-        ------
-        MissingExtra
-            The extra "plot" is not installed.
-        """
-        return cast("Figure", module_of_extra("heliopsf.plots").before_and_after(self))
-
 
 @dataclass(frozen=True, kw_only=True, repr=False)
-class Convolution(Shown, Convolved):
+class Convolution(_BeforeAndAfter, Convolved):
     """A model image as a telescope records it.
 
     Attributes
@@ -222,36 +226,6 @@ class Convolution(Shown, Convolved):
             PSF and edges; then shape, brightest pixel, and the share of the light that stays in the field.
         """
         return forward.lines(self, used_psf(self.psf))
-
-    def quicklook(self) -> Figure:
-        """Draw the image before and after, and the change.
-
-        Returns
-        -------
-        Figure
-            Three panels.
-
-        Raises
-        ------
-        MissingExtra
-            The extra "plot" is not installed.
-        """
-        return cast("Figure", module_of_extra("heliopsf.plots").before_and_after(self))
-
-    def title(self, psf: UsedPsf) -> str:
-        """Name the PSF, for the title of a picture.
-
-        Parameters
-        ----------
-        psf : UsedPsf
-            The PSF as the cards of the result name it.
-
-        Returns
-        -------
-        str
-            One line.
-        """
-        return f"convolved with PSF {psf.name} {psf.version}"
 
     def write(self, path: str | Path) -> None:
         """Write a FITS file. A file of this name is replaced.

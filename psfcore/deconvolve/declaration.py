@@ -14,7 +14,8 @@ from typing import Any, Literal
 
 from psfcore.errors import DataError
 
-Edges = Literal["zero", "symmetric", "extended"]
+KnownScene = Literal["zero", "symmetric"]  # beyond the edges
+Edges = Literal[KnownScene, "extended"]
 Stop = Literal["fixed", "discrepancy"]
 Value = int | float
 MOST_STEPS = 1000  # far beyond the point from which steps fit the noise

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from psfcore import software_version
 from psfcore.convolution.engine import Engine
 from psfcore.deconvolve.conditions import Progress
-from psfcore.deconvolve.declaration import Edges
+from psfcore.deconvolve.declaration import KnownScene
 from psfcore.deconvolve.doubts import input_warnings
 from psfcore.deconvolve.edges import lay_out, margin_for, share_from_beyond
 from psfcore.deconvolve.run import BUILDING, Cards, PsfSource, UsedPsf
@@ -20,8 +21,6 @@ from psfcore.errors import DataError
 from psfcore.fits.images import write_image
 from psfcore.image import Image
 from psfcore.psf import Psf
-
-EDGES: tuple[Edges, ...] = ("zero", "symmetric")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,8 +34,23 @@ class Convolved:
     pixels: NDArray[np.float64]
     image: Image
     psf: Psf
-    edges: Edges
+    edges: KnownScene
     warnings: Mapping[str, str]
+
+    def title(self, psf: UsedPsf) -> str:
+        """Name the PSF and the edges, for the title of a picture.
+
+        Parameters
+        ----------
+        psf : UsedPsf
+            The PSF as the cards of the result name it.
+
+        Returns
+        -------
+        str
+            One line.
+        """
+        return f"convolved with PSF {psf.name} {psf.version}, edges {self.edges}"
 
 
 def cards(found: Convolved, psf: UsedPsf) -> Cards:
@@ -71,7 +85,7 @@ def lines(found: Convolved, psf: UsedPsf) -> list[str]:
         else ""
     )
     return [
-        f"convolved with PSF {psf.name} {psf.version}, edges {found.edges}",
+        found.title(psf),
         f"{nx} x {ny} px; brightest pixel {before.max():.4g} before, {after.max():.4g} after{kept}",
     ]
 
@@ -82,16 +96,16 @@ def write(found: Convolved, path: Path, psf: UsedPsf) -> None:
     write_image(path, image, cards=cards(found, psf), history=history(found, psf))
 
 
-def convolve(image: Image, psf: Psf, *, edges: Edges = "zero", threads: int = 1) -> NDArray[np.float64]:
+def convolve(image: Image, psf: Psf, *, edges: KnownScene = "zero", threads: int = 1) -> NDArray[np.float64]:
     """Convolve an image with a PSF: H x of Eq. (1) in `psfcore.convolution.convolver`. Returns the pixels [y, x].
 
     psf: the PSF on the pixels of the image. edges: the scene beyond the image, "zero" or "symmetric" (its mirror
     image, as far as light reaches). Pixels without a value send no light, and stay without one.
     Raises DataError "bad-edges", "all-masked" and "no-signal".
     """
-    if edges not in EDGES:
+    if edges not in (known := get_args(KnownScene)):
         raise DataError(
-            "bad-edges", f"expected edges zero or symmetric, the scene beyond the image; got {edges!r:.60}"
+            "bad-edges", f"expected edges {' or '.join(known)}, the scene beyond the image; got {edges!r:.60}"
         )
     ny, nx = image.pixels.shape
     margin_px = margin_for(share_from_beyond(psf), (ny, nx), share=0.0)
@@ -106,7 +120,7 @@ def convolve_image(
     image: Image,
     source: PsfSource,
     *,
-    edges: Edges = "zero",
+    edges: KnownScene = "zero",
     threads: int = 1,
     begin: Callable[[str, int], Progress | None] = lambda stage, steps: None,
 ) -> Convolved:

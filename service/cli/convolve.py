@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, get_args
 
 import click
 
+from psfcore.deconvolve.declaration import KnownScene
 from service.cli.connection import PSF, named_psf
 from service.cli.options import DRAWN, FILE, OUTPUT, OVERWRITE, options_of
 from service.cli.progress import echo, progress_bar
 from service.client.outputs import check_outputs, written
 from workers.contract.requests import Deconvolve
-
-if TYPE_CHECKING:
-    from psfcore.deconvolve.declaration import Edges
 
 
 @click.command()
@@ -23,7 +21,7 @@ if TYPE_CHECKING:
 @PSF
 @click.option(
     "--edges",
-    type=click.Choice(("zero", "symmetric")),
+    type=click.Choice(get_args(KnownScene)),
     default="zero",
     help="The scene beyond the image: dark, or the mirror image",
 )
@@ -34,7 +32,7 @@ def convolve(
     image: Path,
     output: Path,
     psf: str | None,
-    edges: Edges,
+    edges: KnownScene,
     plot: Path | None,
     overwrite: bool,
     **parameters: Any,
@@ -57,9 +55,9 @@ def convolve(
             from psfcore.drawing.plots import preview_png
             from psfcore.fits.units import unit_label
 
-            first, _ = lines(found, used)
+            title, unit = found.title(used), unit_label(found.image)
             with written(plot, overwrite=overwrite) as file:
-                preview_png(found.image.pixels, found.pixels, file, title=first, unit=unit_label(found.image))
+                preview_png(found.image.pixels, found.pixels, file, title=title, unit=unit)
     for message in found.warnings.values():
         echo(f"warning: {message}", err=True)
     first, *others = lines(found, used)

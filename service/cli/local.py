@@ -21,7 +21,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 from psfcore import limited
 from psfcore.compiled import listening
 from psfcore.deconvolve.box import Box
-from psfcore.deconvolve.declaration import Edges
+from psfcore.deconvolve.declaration import KnownScene
 from psfcore.deconvolve.forward import Convolved, convolve_image
 from psfcore.deconvolve.run import UsedPsf
 from psfcore.errors import DataError
@@ -33,7 +33,6 @@ from psfcore.fits.observation import read_observation
 from psfcore.fits.psfs import stated_id
 from psfcore.fits.stored_psf import check_no_product
 from psfcore.gap.effect_sources import sha256_of_source
-from psfcore.instruments.model import parse_instrument
 from psfcore.instruments.unknown import unknown_instrument
 from psfcore.instruments.workload import check_workload
 from psfcore.transit.archive import list_archive, transit_in
@@ -46,7 +45,7 @@ from workers.contract.identities import (
     build_for,
     check_noise,
     diffraction_build,
-    instrument_text,
+    instrument_of_build,
     product_identity,
     psf_identity,
 )
@@ -207,7 +206,7 @@ class Local(Operations):
         del self.inputs.results[ResultType.PRODUCT, product["id"]]
 
     def convolve(
-        self, image_id: str, edges: Edges, report: Progress, **named: object
+        self, image_id: str, edges: KnownScene, report: Progress, **named: object
     ) -> tuple[Convolved, UsedPsf]:
         """Convolve an image with a PSF; returns also how cards name the PSF. named: further fields of the request for a
         deconvolution of the image, such as ``psf_id``.
@@ -247,8 +246,7 @@ class Local(Operations):
 
     @staticmethod
     def _resolved_build(build: PsfBuild) -> PsfBuild:
-        label = build.instrument or "instrument_file"
-        check_workload(parse_instrument(instrument_text(build), label), label)
+        check_workload(instrument_of_build(build), build.instrument or "instrument_file")
         return build
 
     def _resolved_on_transit(

@@ -19,12 +19,11 @@ from psfcore.fits.blocks import LIMITS, FitsLimits
 from psfcore.fits.channel import PsfOrigin
 from psfcore.fits.header import HeaderSummary, read_summary
 from psfcore.fits.psfs import read_psf
-from psfcore.instruments.model import parse_instrument
 from psfcore.instruments.unknown import channel_of
 from psfcore.psf import Psf
 from psfcore.psf_cache import built_file, kept_psf
 from psfcore.transit.archive import ArchiveContents, unpack
-from workers.contract.identities import instrument_text, recipe_of
+from workers.contract.identities import instrument_of_build, recipe_of
 from workers.contract.kinds import ResultType
 from workers.contract.requests import Deconvolve, PsfBuild, ResolvedDeconvolve
 from workers.lookup import no_such
@@ -175,19 +174,14 @@ class LocalWorkspace(Workspace):
             prepared=self.inputs.prepared,
             other_channel=request.other_channel,
         )
-        build = request.psf_recipe
+        named_build = self.inputs.builds.get(request.psf_id)
+        build = request.psf_recipe or named_build
         if build is not None:
             recipe = recipe_of(build)
-            return source(lambda _, progress: self._kept(recipe, progress, parts=False))
-        build = self.inputs.builds.get(request.psf_id)
-        if build is not None:
-            instrument = parse_instrument(instrument_text(build), build.instrument or "instrument_file")
-            recipe = recipe_of(build)
-            return source(
-                lambda _, progress: self._kept(recipe, progress, parts=False),
-                key=request.psf_id,
-                built=PsfOrigin.of_instrument(instrument),
-            )
+            source = partial(source, lambda _, progress: self._kept(recipe, progress, parts=False))
+            if named_build is None:  # of the telescope in the header
+                return source()
+            return source(key=request.psf_id, built=PsfOrigin.of_instrument(instrument_of_build(named_build)))
         parts, named = request.error_draws > 0, self.inputs.psfs.get(request.psf_id)
         psf = self.psf(request.psf_id, parts=parts)
         source = partial(source, lambda *_: psf, key=(request.psf_id, parts), kernel_shape=psf.kernel.shape)

@@ -555,7 +555,7 @@ def named_instrument(instrument: str | Path) -> dict[str, str]:
     return {"instrument": instrument}
 
 
-def without_none(parameters: Mapping[str, Value]) -> dict[str, Value]:
+def without_none(parameters: Mapping[str, Value | None]) -> dict[str, Value]:
     """The parameters that are not None. The service has defaults for the others."""
     return {name: value for name, value in parameters.items() if value is not None}
 

@@ -82,3 +82,11 @@ def test_the_command_writes_what_the_function_returns(tmp_path: Path) -> None:
     assert fits.getheader(output)["CNVPSFV"] == expected.psf.version
     again = CliRunner().invoke(main, command)
     assert again.exit_code != 0 and "recorded.fits" in again.output
+
+
+def test_a_psf_of_another_channel_is_refused_before_it_is_built(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("heliopsf.psfs.built_psf", lambda *_, **__: pytest.fail("the PSF was built"))
+    header = {"TELESCOP": "SDO/AIA", "INSTRUME": "AIA_1", "WAVELNTH": 193, "WAVEUNIT": "angstrom"}
+    with pytest.raises(DataError) as caught:
+        heliopsf.convolve((SCENE, header), "aia_171")
+    assert caught.value.code == "channel-mismatch"

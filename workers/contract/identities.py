@@ -8,6 +8,7 @@ from typing import Any
 from psfcore.errors import DataError
 from psfcore.gap.effect_sources import library_sha256
 from psfcore.instruments.files import instrument_names, instrument_path, turned_text
+from psfcore.instruments.model import Instrument, parse_instrument
 from psfcore.noise import NoiseFigures
 from psfcore.recipe import Recipe
 from psfcore.recipe import canonical_hash as canonical_hash
@@ -33,6 +34,11 @@ def instrument_text(build: PsfBuild) -> str:
         return build.instrument_file
     assert build.instrument is not None
     return instrument_path(build.instrument).read_text("utf-8")
+
+
+def instrument_of_build(build: PsfBuild) -> Instrument:
+    """The instrument that a build describes. Raises the errors of `instrument_text` and of `parse_instrument`."""
+    return parse_instrument(instrument_text(build), build.instrument or "instrument_file")
 
 
 def build_for(instrument: str, turn_deg: float) -> PsfBuild:

@@ -24,12 +24,11 @@ from weakref import WeakKeyDictionary
 from psfcore.deconvolve.box import Box
 from psfcore.deconvolve.memory import EXPECTED_RIM_PX, MIB, Demand, product_bytes
 from psfcore.errors import DataError
-from psfcore.instruments.model import parse_instrument
 from psfcore.instruments.workload import workload
 from psfcore.recipe import REACH_GRID_PX
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ImageRow, PsfRow, TransitRow
-from workers.contract.identities import instrument_text
+from workers.contract.identities import instrument_of_build
 from workers.contract.kinds import KINDS
 from workers.contract.requests import PsfBuild
 from workers.intake.costs import COSTS, OTHER, WORKER_MIB, job_s
@@ -186,7 +185,7 @@ def estimate_build(
         # This is a rerun. The text of the instrument file is in the file of the PSF, which is not read here.
         return OUTLINE_NS * 1e-9 * LEAST_OUTLINES * LEAST_CELLS**2, MESHES_MIB + GRID_MIB * grid**2
     build = PsfBuild.model_validate(parameters)
-    instrument = parse_instrument(instrument_text(build), build.instrument or "instrument_file")
+    instrument = instrument_of_build(build)
     work = workload(instrument, size)
     line_s = LINE_S + MESH_S * len(instrument.meshes)
     if work.mask:

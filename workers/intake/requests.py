@@ -10,7 +10,6 @@ from psfcore.deconvolve.box import Box
 from psfcore.fits.frame import frame_of
 from psfcore.fits.header import check_not_deconvolved
 from psfcore.gap.effect_sources import sha256_of_source
-from psfcore.instruments.model import parse_instrument
 from psfcore.instruments.workload import check_workload
 from workers.catalogue.catalogue import Catalogue, Row
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, TransitRow
@@ -19,7 +18,7 @@ from workers.contract.identities import (
     canonical_hash,
     check_noise,
     diffraction_build,
-    instrument_text,
+    instrument_of_build,
     interpolated_psf_identity,
     psf_identity,
 )
@@ -101,8 +100,7 @@ def resolve_by_ids(submission: Submission) -> Parameters:
 def resolve_psf_build(submission: Submission) -> Parameters:
     """Check the instrument file and the mask of a PSF build."""
     build: PsfBuild = submission.parameters
-    label = build.instrument or "instrument_file"
-    check_workload(parse_instrument(instrument_text(build), label), label)
+    check_workload(instrument_of_build(build), build.instrument or "instrument_file")
     if build.mask_id is not None:
         submission.row(ImageRow, build.mask_id)
     return build

@@ -85,7 +85,7 @@ def _filter_options(command: Command) -> Command:
 @on_service
 def list_psfs(service: Client, **options: str | None) -> None:
     """List the PSFs of a service."""
-    filters = {name: value for name, value in options.items() if value is not None}
+    filters = without_none(options)
     none = "no PSF with " + ", ".join(f"{name} {value}" for name, value in filters.items())
     if not filters:
         none = "no PSF yet; `heliopsf psf build` or the first deconvolution makes a PSF"
