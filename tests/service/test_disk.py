@@ -174,7 +174,9 @@ def test_a_damaged_database_is_told_of(api: TestClient, settings: Settings) -> N
 
 def test_a_request_to_a_damaged_database_is_answered_clearly(api: TestClient, settings: Settings) -> None:
     assert "damaged" not in api.get("/readyz").text
-    api.app.state.heliopsf.catalogue.close()  # pages in memory are still good
+    state = api.app.state.heliopsf
+    state.reconciler.stop()  # its rounds would open connections that keep good pages in memory
+    state.catalogue.close()
     file = database_file(settings)
     # The files beside it are mapped into memory: a shorter one would end this process.
     file.write_bytes(b"\0" * file.stat().st_size)
