@@ -157,7 +157,8 @@ def database_file(settings: Settings) -> Path:
     """The file of the database, with all changes in it."""
     file = settings.data_dir / "catalogue.sqlite"
     connection = sqlite3.connect(file)
-    connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    busy, *_ = connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
+    assert not busy, "a reader keeps pages of the log, which would hide the damage"
     connection.close()
     return file
 
