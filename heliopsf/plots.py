@@ -17,6 +17,8 @@ from psfcore.drawing.plots import (
     CHANGE_LIMIT_PCT,
     GOLD,
     change_pct,
+    curve_label,
+    curves_of,
     preview_figure,
     square_root_stretch,
 )
@@ -51,10 +53,8 @@ def draw_curves(psf: Psf, axes: Axes | None) -> Axes:
     """Draw the light beyond each radius, of a PSF and of its components."""
     axes = _axes(axes)
     radii = np.geomspace(0.5, psf.reach_px, 400)
-    for name, kernel in {"total": psf.kernel, **psf.components}.items():
-        axes.semilogx(
-            radii, cumulative_curve(kernel, radii), label=name.lower().replace("_", " "), linewidth=1.5
-        )
+    for names, kernel in curves_of(psf).items():
+        axes.semilogx(radii, cumulative_curve(kernel, radii), label=curve_label(names), linewidth=1.5)
     axes.set(
         xlabel="Radius (px)",
         ylabel="1 - encircled energy (%)",
