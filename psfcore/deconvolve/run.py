@@ -61,12 +61,12 @@ class UsedPsf:
 class Identities:
     """What a product file says about its origin.
 
-    product: id of the product. input_sha256: hash of the file of the image. algorithm_version: version of the method.
-    filename: name of the product.
+    product: id of the product; None: it was made without a request. input_sha256: hash of the file of the image; None:
+    not known. algorithm_version: version of the method. filename: name of the product.
     """
 
-    product: str
-    input_sha256: str
+    product: str | None
+    input_sha256: str | None
     algorithm_version: int
     filename: str
 
@@ -359,12 +359,12 @@ def write(product: Product, path: Path, psf: UsedPsf, ids: Identities) -> None:
         sha256=ids.input_sha256,
     )
     # The order of the cards must not change, because equal requests must give equal bytes.
-    cards: Cards = {"PRODID": (ids.product, "")}
+    cards: Cards = {} if ids.product is None else {"PRODID": (ids.product, "")}
     for key, card in deconvolution_cards(product, psf).items():
         if key == "SWHELIO":
             cards["DCNVALGV"] = (ids.algorithm_version, "algorithm version")
         cards[key] = card
-        if key == "SWHELIO":
+        if key == "SWHELIO" and ids.input_sha256 is not None:
             cards["INPSHA"] = (ids.input_sha256, "")
     write_image(
         path,
