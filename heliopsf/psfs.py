@@ -118,7 +118,7 @@ class Psf(Shown, CorePsf):
         Raises
         ------
         DataError
-            "bad-quantity".
+            "bad-quantity", or "bad-radius" for a negative radius and one that is not finite.
         """
         return cumulative_curve(self.kernel, radii_px(radii, self.plate_scale_arcsec))
 
