@@ -23,6 +23,7 @@ from psfcore.drawing.plots import (
     square_root_stretch,
 )
 from psfcore.fits.units import unit_label
+from psfcore.instruments.psf_statements import title
 from psfcore.psf import Psf, crop_centred, cumulative_curve
 
 if TYPE_CHECKING:
@@ -44,7 +45,11 @@ def draw_psf(psf: Psf, axes: Axes | None, *, size: int) -> Axes:
         extent=(-half - 0.5, side - half - 0.5, -half - 0.5, side - half - 0.5),
         interpolation="nearest",
     )
-    axes.set(xlabel="x from centre (px)", ylabel="y from centre (px)", title=f"PSF {psf.name} {psf.version}")
+    axes.set(
+        xlabel="x from centre (px)",
+        ylabel="y from centre (px)",
+        title=title(psf.name, psf.version, psf.status),
+    )
     _figure(axes).colorbar(drawn, ax=axes, label="Weight (fraction per pixel)")
     return axes
 
@@ -58,7 +63,7 @@ def draw_curves(psf: Psf, axes: Axes | None) -> Axes:
     axes.set(
         xlabel="Radius (px)",
         ylabel="1 - encircled energy (%)",
-        title=f"PSF {psf.name} {psf.version}",
+        title=title(psf.name, psf.version, psf.status),
         xlim=(0.5, psf.reach_px),
     )
     axes.set_ylim(bottom=0)

@@ -21,6 +21,7 @@ from psfcore.deconvolve.run import BUILDING, Cards, PsfSource, UsedPsf
 from psfcore.errors import DataError
 from psfcore.fits.images import write_image
 from psfcore.image import Image
+from psfcore.instruments.psf_statements import title
 from psfcore.psf import Psf
 
 
@@ -51,7 +52,7 @@ class Convolved:
         str
             One line.
         """
-        return f"convolved with PSF {psf.name} {psf.version}, edges {self.edges}"
+        return f"convolved with {title(psf.name, psf.version, psf.status)}, edges {self.edges}"
 
 
 def cards(found: Convolved, psf: UsedPsf) -> Cards:
@@ -70,8 +71,7 @@ def cards(found: Convolved, psf: UsedPsf) -> Cards:
 def history(found: Convolved, psf: UsedPsf) -> list[str]:
     """The lines of HISTORY."""
     return [
-        f"heliopsf {software_version()}: convolved with PSF {psf.name} {psf.version} ({psf.status}), "
-        f"edges {found.edges}",
+        f"heliopsf {software_version()}: {found.title(psf)}",
         *(f"WARNING ({code}): {message}" for code, message in found.warnings.items()),
     ]
 

@@ -26,6 +26,7 @@ from matplotlib.ticker import FixedFormatter, FuncFormatter, MaxNLocator
 from numpy.typing import NDArray
 
 from psfcore.drawing.thumbnail import EUV_POINTS, NO_DATA, block_means
+from psfcore.instruments.psf_statements import title
 from psfcore.psf import REACH_GRID_PX, Kernel, Psf, crop_centred, cumulative_curve, radial_profile
 
 PANEL_PX = 640
@@ -201,7 +202,7 @@ def psf_figure(psf: Psf) -> Figure:
         facecolor="white",
         layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.08),
     )
-    heading = f"PSF {psf.name} {psf.version} ({psf.status}), sum {psf.total:.4f} on {psf.kernel.shape[1]} px"
+    heading = f"{title(psf.name, psf.version, psf.status)}, sum {psf.total:.4f} on {psf.kernel.shape[1]} px"
     figure.suptitle(heading, fontsize=14, color=INK, weight="bold", x=0.01, ha="left")
     image_axes, profile_axes, curve_axes = figure.subplots(1, 3, width_ratios=(1.12, 1, 1))
     _draw_centre(figure, image_axes, psf)

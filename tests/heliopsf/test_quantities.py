@@ -99,8 +99,8 @@ def test_a_psf_may_be_named_by_its_instrument(small_toml: Path, psf: heliopsf.Ps
 def test_results_show_themselves_in_two_lines_and_with_a_picture(psf: heliopsf.Psf) -> None:
     result = heliopsf.deconvolve(a_map(), psf, full=True, steps=2)
     for shown, words in (
-        (psf, ("small", "draft", "171 angstrom", "64 x 64 px", "diffraction")),
-        (result, ("SMALL_1 2024-03-01", "PSF small", "without diffuse scatter", "128 x 96 px", "2 steps")),
+        (psf, ("small", "draft", "171 angstrom", "64 x 64 px", "diffraction", "scattered light stays")),
+        (result, ("SMALL_1 2024-03-01", "PSF small", "scattered light stays", "128 x 96 px", "2 steps")),
     ):
         text = repr(shown)
         assert len(text.splitlines()) == 2 and len(text) < 400
