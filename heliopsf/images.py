@@ -241,8 +241,8 @@ def convolve(
     Raises
     ------
     DataError
-        "bad-edges", "no-signal", "all-masked", "no-psf-for-instrument", "channel-mismatch" or "plate-scale-mismatch",
-        and the errors of reading.
+        "bad-edges", "no-signal", "all-masked", "too-much-memory", "no-psf-for-instrument", "channel-mismatch" or
+        "plate-scale-mismatch", and the errors of reading.
 
     Warns
     -----
@@ -259,7 +259,9 @@ def convolve(
     )
     with on_disk(smap) as there:
         image = image_of(there, saturation=None, hdu=hdu)
-        found = convolve_image(image, of_image, edges=edges, threads=count, begin=begin)
+        found = convolve_image(
+            image, of_image, edges=edges, threads=count, free_bytes=free_bytes(), begin=begin
+        )
         for code, message in found.warnings.items():
             warnings.warn(DataWarning(code, message), stacklevel=2)
         result = Convolution(**vars(found) | {"psf": Psf.of(found.psf)})

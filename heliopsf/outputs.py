@@ -18,12 +18,20 @@ from numpy.typing import NDArray
 
 from heliopsf.inputs import hdu_of, is_hdu, is_map, is_nddata, is_pair
 from heliopsf.psfs import Psf, Shown
-from psfcore.deconvolve import forward
+from psfcore.deconvolve import forward, run
 from psfcore.deconvolve.forward import Convolved
-from psfcore.deconvolve.run import Cards, Product, UsedPsf, deconvolution_cards, deconvolution_history
+from psfcore.deconvolve.methods.registry import properties_of
+from psfcore.deconvolve.run import (
+    Cards,
+    Identities,
+    Product,
+    UsedPsf,
+    deconvolution_cards,
+    deconvolution_history,
+)
 from psfcore.deconvolve.summary import summary_lines
-from psfcore.errors import module_of_extra
-from psfcore.files import whole_path
+from psfcore.errors import DataError, module_of_extra
+from psfcore.files import check_ending, whole_path
 from psfcore.fits.images import CARD_OF_PASS, STATISTICS, passes_of
 from psfcore.image import Image
 
@@ -181,6 +189,37 @@ class Deconvolution(_BeforeAndAfter, Product):
             The extra "plot" is not installed.
         """
         return cast("Axes", module_of_extra("heliopsf.plots").draw_change(self, axes))
+
+    def write(self, path: str | Path, overwrite: bool = False) -> None:
+        """Write the FITS file that ``heliopsf deconvolve`` writes: image, planes, cards and HISTORY.
+
+        The file has no id of a product (PRODID) and no hash of its input (INPSHA), which come from a request.
+
+        Parameters
+        ----------
+        path : str or path
+            The file; a name that ends in .gz gets a file in gzip.
+        overwrite : bool
+            Whether a file of this name is replaced.
+
+        Raises
+        ------
+        DataError
+            "output-exists": there is a file of this name, and ``overwrite`` is false.
+        OSError
+            The file cannot be written, or its name ends in .fz.
+        """
+        target = Path(path)
+        if target.exists() and not overwrite:
+            raise DataError(
+                "output-exists",
+                f"expected the name of a new file; {target} exists: name another file, or replace it with "
+                "overwrite=True",
+            )
+        check_ending(target)
+        ids = Identities(None, None, properties_of(self.method).algorithm_version, target.name)
+        with whole_path(target) as file:
+            run.write(self, file, used_psf(self.psf), ids)
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)

@@ -156,10 +156,17 @@ def level_dn(level: object, header: Cards) -> float | None:
 
 
 def radii_px(radii: ArrayLike | units.Quantity, plate_scale_arcsec: float | None) -> NDArray[np.float64]:
-    """Radii in px. Angles need the plate scale. Raises DataError "bad-quantity"."""
+    """Radii in px. Angles need the plate scale. Raises DataError "bad-quantity", and "bad-radius" if a radius is
+    negative or not finite.
+    """
     if isinstance(radii, units.Quantity) and radii.unit.is_equivalent(units.arcsec) and plate_scale_arcsec:
-        return plain("radii", radii, units.arcsec) / plate_scale_arcsec
-    return plain("radii", radii, units.pix)
+        lengths = plain("radii", radii, units.arcsec) / plate_scale_arcsec
+    else:
+        lengths = plain("radii", radii, units.pix)
+    wrong = lengths[~((lengths >= 0) & np.isfinite(lengths))]
+    if wrong.size:
+        raise DataError("bad-radius", f"radii: expected finite radii of 0 px or more; got {wrong[0]:g} px")
+    return lengths
 
 
 def reporter(progress: Progress, stage: str) -> Steps | None:

@@ -17,10 +17,13 @@ from psfcore.drawing.plots import (
     CHANGE_LIMIT_PCT,
     GOLD,
     change_pct,
+    curve_label,
+    curves_of,
     preview_figure,
     square_root_stretch,
 )
 from psfcore.fits.units import unit_label
+from psfcore.instruments.psf_statements import title
 from psfcore.psf import Psf, crop_centred, cumulative_curve
 
 if TYPE_CHECKING:
@@ -42,7 +45,11 @@ def draw_psf(psf: Psf, axes: Axes | None, *, size: int) -> Axes:
         extent=(-half - 0.5, side - half - 0.5, -half - 0.5, side - half - 0.5),
         interpolation="nearest",
     )
-    axes.set(xlabel="x from centre (px)", ylabel="y from centre (px)", title=f"PSF {psf.name} {psf.version}")
+    axes.set(
+        xlabel="x from centre (px)",
+        ylabel="y from centre (px)",
+        title=title(psf.name, psf.version, psf.status),
+    )
     _figure(axes).colorbar(drawn, ax=axes, label="Weight (fraction per pixel)")
     return axes
 
@@ -51,14 +58,12 @@ def draw_curves(psf: Psf, axes: Axes | None) -> Axes:
     """Draw the light beyond each radius, of a PSF and of its components."""
     axes = _axes(axes)
     radii = np.geomspace(0.5, psf.reach_px, 400)
-    for name, kernel in {"total": psf.kernel, **psf.components}.items():
-        axes.semilogx(
-            radii, cumulative_curve(kernel, radii), label=name.lower().replace("_", " "), linewidth=1.5
-        )
+    for names, kernel in curves_of(psf).items():
+        axes.semilogx(radii, cumulative_curve(kernel, radii), label=curve_label(names), linewidth=1.5)
     axes.set(
         xlabel="Radius (px)",
         ylabel="1 - encircled energy (%)",
-        title=f"PSF {psf.name} {psf.version}",
+        title=title(psf.name, psf.version, psf.status),
         xlim=(0.5, psf.reach_px),
     )
     axes.set_ylim(bottom=0)

@@ -22,11 +22,13 @@ from psfcore.fits.header import utc_time
 from psfcore.fits.images import read_mask_image
 from psfcore.instruments.files import instrument_names, instrument_path, turned_text
 from psfcore.instruments.model import Instrument, load_instrument, read_instrument_text
+from psfcore.instruments.psf_statements import caveats, title
+from psfcore.instruments.published import PUBLISHED
 from psfcore.psf import Psf as CorePsf
 from psfcore.psf import cumulative_curve
 from psfcore.psf_cache import kept_psf
 from psfcore.psf_sampling import rebinned
-from psfcore.published_psfs import PUBLISHED, kept_file
+from psfcore.published_psfs import kept_file
 from psfcore.recipe import Recipe
 from psfcore.scatter.interpolation import Epoch, interpolated_psf
 from workers.machine import cores, psf_cache, published_folder
@@ -118,7 +120,7 @@ class Psf(Shown, CorePsf):
         Raises
         ------
         DataError
-            "bad-quantity".
+            "bad-quantity", or "bad-radius" for a negative radius and one that is not finite.
         """
         return cumulative_curve(self.kernel, radii_px(radii, self.plate_scale_arcsec))
 
@@ -223,7 +225,8 @@ class Psf(Shown, CorePsf):
         Returns
         -------
         list of str
-            Which PSF it is; then its shape, where its light is, and its components.
+            Which PSF it is; then its shape, where its light is, its components, what is assumed in it, and the
+            scattered light that it leaves in an image.
         """
         origin = [self.instrument or "instrument unknown"]
         origin += [f"{self.wavelength_angstrom:g} angstrom"] if self.wavelength_angstrom else []
@@ -235,9 +238,14 @@ class Psf(Shown, CorePsf):
         )
         ny, nx = self.kernel.shape
         return [
-            f"PSF {self.name} {self.version} ({self.status}): {', '.join(origin)}",
-            f"{nx} x {ny} px, central pixel {self.kernel.max():.3g}, {beyond}; components: "
-            f"{', '.join(self.components).lower() or 'none'}",
+            f"{title(self.name, self.version, self.status)}: {', '.join(origin)}",
+            "; ".join(
+                (
+                    f"{nx} x {ny} px, central pixel {self.kernel.max():.3g}, {beyond}",
+                    f"components: {', '.join(self.components).lower() or 'none'}",
+                    *caveats(self.name, self.instrument, self.provenance),
+                )
+            ),
         ]
 
     @classmethod

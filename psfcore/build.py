@@ -25,6 +25,7 @@ from psfcore.diffraction.combined import DIFFRACTION, available_parts, diffracti
 from psfcore.errors import DataError
 from psfcore.instruments.files import instrument_names
 from psfcore.instruments.model import Instrument, load_instrument, parse_instrument
+from psfcore.instruments.psf_statements import bases_of, version_text
 from psfcore.instruments.workload import LARGEST_SIZE_PX, check_workload
 from psfcore.psf import REACH_GRID_PX, Psf, crop_centred
 from psfcore.recipe import Recipe
@@ -100,7 +101,7 @@ def build_psf(
     return Psf(
         kernel=crop_centred(kernel, shape),
         name=instrument.name,
-        version=instrument.version + ("-draft" if instrument.status == "draft" else ""),
+        version=version_text(instrument.version, instrument.status),
         instrument=instrument.name,
         status=instrument.status,
         plate_scale_arcsec=instrument.detector.plate_scale_arcsec,
@@ -123,8 +124,9 @@ def build_recipe(
 
     parts: see `build_psf`. Raises the errors of `build_psf` and of `parse_instrument`.
     """
+    instrument = parse_instrument(recipe.text, recipe.name or "instrument_file")
     psf = build_psf(
-        parse_instrument(recipe.text, recipe.name or "instrument_file"),
+        instrument,
         size=recipe.size,
         component=recipe.component and recipe.component.upper(),
         parts=parts,
@@ -134,7 +136,7 @@ def build_recipe(
     )
     return replace(
         psf,
-        version=f"{psf.version}+{recipe.identity[:8]}",
+        version=version_text(instrument.version, instrument.status, recipe.identity),
         provenance={
             **psf.provenance,
             "psf_id": recipe.identity,
@@ -159,23 +161,21 @@ def _on_full_reach(kernel: Kernel) -> tuple[Kernel, float]:
 def _provenance(
     instrument: Instrument, notes: dict[str, object], past_reach: dict[str, float]
 ) -> dict[str, object]:
-    law, mount = instrument.scatter, instrument.mount
+    law, bases = instrument.scatter, bases_of(instrument)
     model = "simplified-combined: entrance pupil convolved with filter-wheel mesh series"
     shape = "a softened power law"
     if law is not None and law.b_px is None:
         shape = f"{len(law.laws)} power laws" if law.laws else f"a table of {len(law.table)} radii"
     about: dict[str, object] = {
         "model": model if law is None else f"{model}, and with {shape}",
-        "mount_basis": "none" if mount is None else mount.basis,
+        "mount_basis": bases["mount_basis"],
         "lines": [[line.wavelength_angstrom, line.weight] for line in instrument.spectral_lines],
         "past_reach": past_reach,
         **notes,
     }
-    if any(mesh.basis == "assumed" for mesh in instrument.meshes):
-        about["mesh_basis"] = "assumed"
+    about |= bases
     if law is not None:
         about |= {
-            "scatter_basis": law.basis,
             "scatter_b_px": law.b_px,
             "scatter_c": law.c,
             "scatter_total": law.total,

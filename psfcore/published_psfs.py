@@ -12,11 +12,8 @@ from __future__ import annotations
 import fcntl
 import json
 import os
-import tomllib
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from functools import partial
-from importlib.resources import files
 from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -26,6 +23,7 @@ from urllib.parse import urljoin, urlsplit
 from psfcore.errors import DataError, did_you_mean, module_of_extra
 from psfcore.files import sha256_of
 from psfcore.fits.blocks import LIMITS
+from psfcore.instruments.published import PUBLISHED, Published
 
 if TYPE_CHECKING:
     from requests import Response
@@ -40,47 +38,6 @@ _BYTES_A_PIXEL = 8  # of the published files: doubles at most
 _MOST_REDIRECTIONS = 5
 # The names of checksums in Dataverse, and those of pooch.
 _ALGORITHMS = {"MD5": "md5", "SHA-1": "sha1", "SHA-256": "sha256", "SHA-512": "sha512"}
-
-
-@dataclass(frozen=True, kw_only=True)
-class Published:
-    """A published PSF.
-
-    channel: wavelength in angstrom, or the energy. contains: the parts of the PSF. citation, doi: of the publication;
-    doi None: no DOI is known. file: name of the published file, (size_px, size_px) px. addresses: where it is, the next
-    one is asked if one fails; empty: place says where to find it. origins: schemes and hosts of the servers that are
-    asked, also those to which an answer leads. instrument: as cards name it. cards: further cards that images must
-    agree with. file_mib: None if unknown. sha256: of the published file; None: the repository tells a checksum at
-    checksum_address; if that is empty, none is known.
-    """
-
-    name: str
-    telescope: str
-    channel: str
-    contains: str
-    citation: str
-    doi: str | None = None
-    version: str
-    file: str
-    size_px: int
-    addresses: list[str]
-    origins: list[str]
-    place: str
-    instrument: str
-    plate_scale_arcsec: float
-    wavelength_angstrom: float | None = None
-    cards: dict[str, str] = field(default_factory=dict)
-    file_mib: int | None = None
-    sha256: str | None = None
-    checksum_address: str = ""
-
-
-_TABLE = tomllib.loads(files("psfcore").joinpath("published_psfs.toml").read_text("utf-8"))
-PUBLISHED = {
-    one["name"]: Published(**publication | one)
-    for publication in _TABLE["publication"]
-    for one in publication.pop("psfs")
-}
 
 
 def published(name: str) -> Published:

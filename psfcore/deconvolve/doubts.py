@@ -21,8 +21,7 @@ from psfcore.convolution.offsets import needed_kernel
 from psfcore.deconvolve.methods.registry import method_names, properties_of
 from psfcore.fits.units import parse_unit
 from psfcore.image import Image
-from psfcore.instruments.files import instrument_names
-from psfcore.instruments.model import load_instrument
+from psfcore.instruments.psf_statements import mesh_is_assumed
 from psfcore.psf import REACH_GRID_PX, Psf
 from psfcore.psf_sampling import frame_warnings
 
@@ -45,7 +44,7 @@ def input_warnings(psf: Psf, image: Image, method: str | None, *, channel: str |
     """
     warnings = frame_warnings(psf, image.header)
     warnings |= {} if channel is None else {"channel": channel}
-    if _mesh_is_assumed(psf):
+    if mesh_is_assumed(psf.name, psf.instrument, psf.provenance):
         warnings["assumed-mesh"] = (
             "the instrument file of the PSF assumes a part of its filter meshes: compare the arms of a bright point "
             "with it (heliopsf arms), or use a published PSF"
@@ -76,16 +75,6 @@ def _cut_warning(psf: Psf, image: Image) -> dict[str, str]:
         "light falls farther, and such light from sources beyond the image is not removed: use a larger image if it "
         "matters"
     }
-
-
-def _mesh_is_assumed(psf: Psf) -> bool:
-    """Whether a PSF was built from an instrument file that assumes a part of its meshes.
-
-    A file of a PSF has no provenance, but the name of its instrument file.
-    """
-    if psf.name == psf.instrument and psf.name in instrument_names():
-        return any(mesh.basis == "assumed" for mesh in load_instrument(psf.name).meshes)
-    return psf.provenance.get("mesh_basis") == "assumed"
 
 
 def _negative_warning(image: Image) -> dict[str, str]:

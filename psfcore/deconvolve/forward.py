@@ -16,10 +16,12 @@ from psfcore.deconvolve.conditions import Progress
 from psfcore.deconvolve.declaration import KnownScene
 from psfcore.deconvolve.doubts import input_warnings
 from psfcore.deconvolve.edges import lay_out, margin_for, share_from_beyond
+from psfcore.deconvolve.memory import check_memory, convolution_bytes
 from psfcore.deconvolve.run import BUILDING, Cards, PsfSource, UsedPsf
 from psfcore.errors import DataError
 from psfcore.fits.images import write_image
 from psfcore.image import Image
+from psfcore.instruments.psf_statements import title
 from psfcore.psf import Psf
 
 
@@ -50,7 +52,7 @@ class Convolved:
         str
             One line.
         """
-        return f"convolved with PSF {psf.name} {psf.version}, edges {self.edges}"
+        return f"convolved with {title(psf.name, psf.version, psf.status)}, edges {self.edges}"
 
 
 def cards(found: Convolved, psf: UsedPsf) -> Cards:
@@ -69,8 +71,7 @@ def cards(found: Convolved, psf: UsedPsf) -> Cards:
 def history(found: Convolved, psf: UsedPsf) -> list[str]:
     """The lines of HISTORY."""
     return [
-        f"heliopsf {software_version()}: convolved with PSF {psf.name} {psf.version} ({psf.status}), "
-        f"edges {found.edges}",
+        f"heliopsf {software_version()}: {found.title(psf)}",
         *(f"WARNING ({code}): {message}" for code, message in found.warnings.items()),
     ]
 
@@ -122,13 +123,19 @@ def convolve_image(
     *,
     edges: KnownScene = "zero",
     threads: int = 1,
+    free_bytes: int | None = None,
     begin: Callable[[str, int], Progress | None] = lambda stage, steps: None,
 ) -> Convolved:
     """Convolve an image with the PSF of a source, which is brought onto the pixels of the image.
 
-    begin: see `psfcore.deconvolve.run.deconvolve`. Raises DataError "plate-scale-known", "plate-scale-mismatch",
-    "channel-mismatch", and the errors of the source and of `convolve`.
+    free_bytes: the free memory, into which the work must fit; None: not known. begin: see
+    `psfcore.deconvolve.run.deconvolve`. Raises DataError "too-much-memory" before the PSF is built,
+    "plate-scale-known", "plate-scale-mismatch", "channel-mismatch", and the errors of the source and of `convolve`.
     """
+    if free_bytes is not None:
+        (ny, nx), (rows, columns) = image.pixels.shape, source.kernel_shape
+        needed = convolution_bytes((ny, nx), (rows, columns), edges)
+        check_memory((ny, nx), needed, free_bytes, task="convolution", advice="use a smaller model image")
     _, fitted, channel = source.on_pixels_of(
         image.header, lambda: source.load(image.header, begin(BUILDING, 1))
     )

@@ -22,6 +22,7 @@ import math
 from dataclasses import dataclass
 
 from psfcore.convolution.lengths import LARGEST_LENGTH, good_length
+from psfcore.deconvolve.declaration import KnownScene
 from psfcore.deconvolve.methods.registry import method_names, properties_of
 from psfcore.errors import DataError
 
@@ -34,6 +35,8 @@ PSF_BYTES = 8.0
 ASSESSED_BYTES = (
     35.0  # for each pixel of an image: to measure the changes, and to draw the pictures of a product
 )
+# Of a convolution: the measured memory with images of 1024 to 3072 px and PSFs of 512 and 2048 px, rounded up.
+CONVOLVED_PLANE_BYTES, CONVOLVED_TRANSFORM_BYTES, CONVOLVED_IMAGE_BYTES = 8.0, 12.0, 24.0
 READ_BYTES = 25.0  # for each pixel of the image beyond the region that is deconvolved
 MIB = 2**20
 
@@ -98,19 +101,41 @@ def product_bytes(demand: Demand, image_px: int) -> float:
     return deconvolution_bytes(demand) + ASSESSED_BYTES * part_px + READ_BYTES * (image_px - part_px)
 
 
-def check_memory(image: Shape, needed_bytes: float, free_bytes: int) -> None:
-    """Raise DataError "too-much-memory" if the deconvolution of an image of this shape needs more than the free memory.
+def convolution_bytes(image: Shape, psf: Shape, edges: KnownScene) -> float:
+    """The memory of a convolution, with its image, its PSF and its result, in bytes: Eq. (1) for a plane with the
+    margin that the light of the PSF can cross.
+    """
+    margin = 0 if edges == "zero" else min(max(psf) // 2, min(image) // 2)
+    plane = image[0] + 2 * margin, image[1] + 2 * margin
+    transform = [_length(size + min(reach // 2, size - 1)) for size, reach in zip(plane, psf, strict=True)]
+    return (
+        CONVOLVED_PLANE_BYTES * math.prod(plane)
+        + CONVOLVED_TRANSFORM_BYTES * math.prod(transform)
+        + CONVOLVED_IMAGE_BYTES * math.prod(image)
+        + PSF_BYTES * math.prod(psf)
+    )
 
-    The system would end the process otherwise, without a message.
+
+def check_memory(
+    image: Shape,
+    needed_bytes: float,
+    free_bytes: int,
+    *,
+    task: str = "deconvolution",
+    advice: str = "deconvolve a part of the image (--region, in Python region=)",
+) -> None:
+    """Raise DataError "too-much-memory" if the task on an image of this shape needs more than the free memory.
+
+    The system would end the process otherwise, without a message. advice: how the task needs less memory.
     """
     if needed_bytes <= free_bytes:
         return
     ny, nx = image
     raise DataError(
         "too-much-memory",
-        f"expected a deconvolution that fits into the free memory, {free_bytes / MIB:.0f} MiB; an image of {nx} x "
-        f"{ny} px needs about {needed_bytes / MIB:.0f} MiB: deconvolve a part of the image (--region, in Python "
-        "region=), end other programs, or use a machine with more memory",
+        f"expected a {task} that fits into the free memory, {free_bytes / MIB:.0f} MiB; an image of {nx} x "
+        f"{ny} px needs about {needed_bytes / MIB:.0f} MiB: {advice}, end other programs, or use a machine with more "
+        "memory",
         {"needed_mib": round(needed_bytes / MIB), "free_mib": round(free_bytes / MIB)},
     )
 

@@ -24,7 +24,7 @@ from psfcore.deconvolve.doubts import input_warnings
 from psfcore.deconvolve.kernels import compiling_beside
 from psfcore.deconvolve.memory import EXPECTED_RIM_PX, Demand, check_memory, product_bytes
 from psfcore.deconvolve.problem import no_noise_model
-from psfcore.deconvolve.summary import assumptions, region_error
+from psfcore.deconvolve.summary import region_error
 from psfcore.deconvolve.work import Assessed, BoxWork, Options, Work, box_work
 from psfcore.fits.cards import optional_text
 from psfcore.fits.channel import PsfOrigin, binning_factor, check_channel
@@ -34,6 +34,7 @@ from psfcore.fits.images import described, write_image
 from psfcore.fits.observation import check_exposure_of_sun
 from psfcore.fits.units import unit_label
 from psfcore.image import Image, MaskBit
+from psfcore.instruments.psf_statements import caveats, title
 from psfcore.psf import REACH_GRID_PX, Psf
 from psfcore.psf_sampling import with_scale
 
@@ -61,12 +62,12 @@ class UsedPsf:
 class Identities:
     """What a product file says about its origin.
 
-    product: id of the product. input_sha256: hash of the file of the image. algorithm_version: version of the method.
-    filename: name of the product.
+    product: id of the product; None: it was made without a request. input_sha256: hash of the file of the image; None:
+    not known. algorithm_version: version of the method. filename: name of the product.
     """
 
-    product: str
-    input_sha256: str
+    product: str | None
+    input_sha256: str | None
     algorithm_version: int
     filename: str
 
@@ -128,7 +129,7 @@ class Product(Deconvolved):
         str
             One line.
         """
-        return f"{self.name}   PSF {psf.name} {psf.version}"
+        return f"{self.name}   {title(psf.name, psf.version, psf.status)}"
 
     def details(
         self, used: UsedPsf | None = None, provenance: Mapping[str, object] | None = None
@@ -159,7 +160,7 @@ class Product(Deconvolved):
                 "name": psf.name,
                 "version": psf.version,
                 "status": psf.status,
-                "assumed": assumptions(provenance or self.psf.provenance),
+                "assumed": caveats(psf.name, self.psf.instrument, provenance or self.psf.provenance),
             },
             "steps_done": self.steps_done,
             "stopped_because": self.stopped_because,
@@ -359,12 +360,12 @@ def write(product: Product, path: Path, psf: UsedPsf, ids: Identities) -> None:
         sha256=ids.input_sha256,
     )
     # The order of the cards must not change, because equal requests must give equal bytes.
-    cards: Cards = {"PRODID": (ids.product, "")}
+    cards: Cards = {} if ids.product is None else {"PRODID": (ids.product, "")}
     for key, card in deconvolution_cards(product, psf).items():
         if key == "SWHELIO":
             cards["DCNVALGV"] = (ids.algorithm_version, "algorithm version")
         cards[key] = card
-        if key == "SWHELIO":
+        if key == "SWHELIO" and ids.input_sha256 is not None:
             cards["INPSHA"] = (ids.input_sha256, "")
     write_image(
         path,
@@ -443,7 +444,7 @@ def deconvolution_history(product: Product, psf: UsedPsf) -> list[str]:
     box, citation = product.of_box, product.psf.provenance.get("citation")
     return [
         f"heliopsf {software_version()}: {product.method}, {product.steps_done} steps, "
-        f"edges {product.edges}, PSF {psf.name} {psf.version} ({psf.status})",
+        f"edges {product.edges}, {title(psf.name, psf.version, psf.status)}",
         *([] if citation is None else [f"publication of the PSF: {citation}"]),
         *(
             []

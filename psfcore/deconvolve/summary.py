@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from psfcore.instruments.psf_statements import title
+
 
 def summary_lines(details: Mapping[str, Any]) -> list[str]:
     """The lines. details: `psfcore.deconvolve.run.Product.details`."""
     psf, noise, region = details["psf"], details["noise"], details["region"]
-    doubts = f": {', '.join(psf['assumed'])}" if psf["assumed"] else ""
     lines = [
-        f"{details['image']}, PSF {psf['name']} {psf['version']} ({psf['status']}{doubts})",
+        f"{details['image']}, {title(psf['name'], psf['version'], psf['status'])}",
+        *([f"of this PSF: {'; '.join(psf['assumed'])}"] if psf["assumed"] else []),
         f"{steps_done(details)}: flux {percent(details['flux_change_pct'], 3)}, brightest 1 % of pixels "
         f"{percent(details['bright_change_pct'])}, darkest 1 % {percent(details['dark_change_pct'])}",
     ]
@@ -43,16 +45,6 @@ def steps_done(details: Mapping[str, Any]) -> str:
     stopped = "" if details["stopped_because"].startswith("all ") else f" ({details['stopped_because']})"
     steps = details["steps_done"]
     return f"{steps} step{'' if steps == 1 else 's'}{stopped}"
-
-
-def assumptions(provenance: Mapping[str, Any]) -> list[str]:
-    """What of a built PSF is not known, from its provenance. Empty for other PSFs."""
-    if "mount_basis" not in provenance:
-        return []
-    scatter = {None: ["without diffuse scatter"], "inferred": ["scatter inferred"]}
-    mount = ["mount of the filter assumed"] if provenance["mount_basis"] == "assumed" else []
-    mesh = ["mesh of the filter assumed"] if "mesh_basis" in provenance else []
-    return mount + mesh + scatter.get(provenance.get("scatter_basis"), [])
 
 
 def percent(value: float | None, digits: int = 1) -> str:

@@ -26,7 +26,8 @@ from matplotlib.ticker import FixedFormatter, FuncFormatter, MaxNLocator
 from numpy.typing import NDArray
 
 from psfcore.drawing.thumbnail import EUV_POINTS, NO_DATA, block_means
-from psfcore.psf import REACH_GRID_PX, Psf, crop_centred, cumulative_curve, radial_profile
+from psfcore.instruments.psf_statements import title
+from psfcore.psf import REACH_GRID_PX, Kernel, Psf, crop_centred, cumulative_curve, radial_profile
 
 PANEL_PX = 640
 CHANGE_LIMIT_PCT = 100.0
@@ -201,25 +202,23 @@ def psf_figure(psf: Psf) -> Figure:
         facecolor="white",
         layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.08),
     )
-    heading = f"PSF {psf.name} {psf.version} ({psf.status}), sum {psf.total:.4f} on {psf.kernel.shape[1]} px"
+    heading = f"{title(psf.name, psf.version, psf.status)}, sum {psf.total:.4f} on {psf.kernel.shape[1]} px"
     figure.suptitle(heading, fontsize=14, color=INK, weight="bold", x=0.01, ha="left")
     image_axes, profile_axes, curve_axes = figure.subplots(1, 3, width_ratios=(1.12, 1, 1))
     _draw_centre(figure, image_axes, psf)
-    kernels = {"TOTAL": psf.kernel, **psf.components}
+    curves = curves_of(psf)
     lowest = []
-    looks = {name: _CURVES.get(name, _OTHER_CURVE) for name in kernels}
-    for name, (colour, width, dashes) in sorted(looks.items(), key=lambda look: look[1][1]):
-        kernel = kernels[name]
-
+    looks = {names: _CURVES.get(names[0], _OTHER_CURVE) for names in curves}
+    for names, (colour, width, dashes) in sorted(looks.items(), key=lambda look: look[1][1]):
+        kernel = curves[names]
         radius, weight = _smoothed_profile(kernel)
         profile_axes.loglog(radius, weight, color=colour, linewidth=width, linestyle=dashes)
         lowest.append(float(weight[-1]) if weight.size else 1.0)
         radii = np.geomspace(0.5, psf.reach_px, 400)
-        label = name.capitalize().replace("_", " ") + (" (open aperture)" if name == "AIRY" else "")
         curve_axes.semilogx(
             radii,
             cumulative_curve(kernel, radii),
-            label=label,
+            label=curve_label(names).capitalize(),
             color=colour,
             linewidth=width,
             linestyle=dashes,
@@ -235,8 +234,25 @@ def psf_figure(psf: Psf) -> Figure:
         axes.grid(which="major", color="#dddddd", linewidth=0.7)
         for side in ("top", "right"):
             axes.spines[side].set_visible(False)
-    figure.legend(loc="outside lower center", ncols=len(kernels), frameon=False, reverse=True)
+    figure.legend(loc="outside lower center", ncols=len(curves), frameon=False, reverse=True)
     return figure
+
+
+def curves_of(psf: Psf) -> dict[tuple[str, ...], Kernel]:
+    """The weights whose curves a figure shows, by their names: "TOTAL" and the components. Equal weights are one curve
+    with several names, because curves that coincide hide each other.
+    """
+    curves: dict[tuple[str, ...], Kernel] = {}
+    for name, kernel in {"TOTAL": psf.kernel, **psf.components}.items():
+        same = next((names for names, one in curves.items() if np.array_equal(one, kernel)), ())
+        curves.pop(same, None)
+        curves[(*same, name)] = kernel
+    return curves
+
+
+def curve_label(names: Sequence[str]) -> str:
+    """The text of a legend for a curve with these names."""
+    return ", ".join(names).lower().replace("_", " ").replace("airy", "airy (open aperture)")
 
 
 def _smoothed_profile(kernel: Plane) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -290,10 +290,10 @@ class Described:
     history: list[str]
 
 
-def described(source: fits.Header, *, filename: str, creator: str, sha256: str) -> Described:
+def described(source: fits.Header, *, filename: str, creator: str, sha256: str | None) -> Described:
     """The cards for a product of the image with the header ``source``.
 
-    filename: name of the product. sha256: hash of the input's file.
+    filename: name of the product. sha256: hash of the input's file; None: not known.
     """
     # A file name may fill the whole card, so cards with a file name have no comment.
     cards: dict[str, tuple[CardValue, str]] = {
@@ -312,7 +312,7 @@ def described(source: fits.Header, *, filename: str, creator: str, sha256: str) 
         for key in _OF_FILE
         if (value := optional_value(source, key)) is not None
     )
-    history = ["SHA-256 of the input file:", sha256, *inputs]
+    history = [*([] if sha256 is None else ["SHA-256 of the input file:", sha256]), *inputs]
     if passes > 1:
         history.append(f"deconvolution number {passes} of this image: the input was a product")
     return Described(kept, cards, history)

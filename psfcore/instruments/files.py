@@ -24,7 +24,6 @@ _MOST_DOTS = 64  # a part of the file without brackets, commas or line ends may 
 _FOLDER = Path(__file__).parent
 # Names of telescopes whose files match a card that does not name the spacecraft.
 _TELESCOPES = {"HRI_EUV": "Solar Orbiter EUI/HRI_EUV", "EUVI": "STEREO/EUVI"}
-_STATUS = re.compile(r'^status = "draft" +# (.+)$', re.MULTILINE)
 
 
 def instrument_names() -> tuple[str, ...]:
@@ -71,14 +70,6 @@ def telescopes() -> dict[str, str]:
         by_telescope.setdefault(telescope_of(name), []).append(angstrom)
     ends = {name: dict.fromkeys((min(channels), max(channels))) for name, channels in by_telescope.items()}
     return {name: " to ".join(f"{channel:g}" for channel in channels) for name, channels in ends.items()}
-
-
-def assumed_in(name: str | None) -> str | None:
-    """What the file of instrument `name` assumes: the comment after its status. None: there is no such draft."""
-    if name not in instrument_names():
-        return None
-    status = _STATUS.search(instrument_path(name).read_text("utf-8"))
-    return None if status is None else status[1].replace(" below", "")
 
 
 def match_instrument(cards: Mapping[str, object]) -> str | None:

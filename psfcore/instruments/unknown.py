@@ -14,6 +14,7 @@ from typing import Any, Literal
 from psfcore.errors import DataError
 from psfcore.instruments.files import PLATE_SCALE_TOLERANCE, WAVELENGTH_TOLERANCE, instrument_names
 from psfcore.instruments.model import load_instrument
+from psfcore.instruments.psf_statements import published_text
 
 WAYS = (
     {
@@ -112,9 +113,7 @@ TELESCOPES = (
         reason="an instrument file describes pupils and meshes, but not mirrors that reflect X-rays at grazing "
         "incidence",
         ways={
-            "upload": "SolarSoft has PSFs of XRT as FITS images in hinode/xrt/idl/util: "
-            "XRT20170324_151721.0.PSF560.fits at 560 eV and XRT20170324_161721.0.PSF1000.fits at 1 keV; `heliopsf "
-            "psf get xrt_560ev_2017` or xrt_1kev_2017 brings the PSF whose energy suits the filters of the image",
+            "upload": "Use a PSF whose energy suits the filters of the image",
             "fit": "In images of the transit of Venus of 2012, the PSF at 560 eV removes 5 % of the light in the disc "
             "of Venus; heliopsf can fit the remaining scatter to these images",
         },
@@ -185,17 +184,18 @@ def unknown_instrument(header: Mapping[str, Any], psfs: Sequence[Mapping[str, An
     ]
     reason = telescope.reason if telescope else _lacking(named, instruments, header)
     candidates = f"These could suit the image: {', '.join(could)}. " if could else ""
+    why = _why(telescope, reason, header["wavelnth"])
     return DataError(
         "no-psf-for-instrument",
         f"expected a telescope whose PSF is known, or a PSF; got an image of {_seen(named, telescope, header)}. "
-        f"{_why(telescope, reason)}{candidates}Give a PSF (psf in Python, psf_id in a request, --psf in a command), "
+        f"{why}{candidates}Give a PSF (psf in Python, psf_id in a request, --psf in a command), "
         "or fit one to a transit",
         {
             "image": telescope.name if telescope else named or "this image",
             "reason": reason,
             "instruments": instruments,
             "psfs": list(psfs),
-            "ways": _ways(telescope),
+            "ways": _ways(telescope, header["wavelnth"]),
         },
     )
 
@@ -223,19 +223,28 @@ def _lacking(named: str, instruments: Sequence[Mapping[str, Any]], header: Mappi
     )
 
 
-def _why(telescope: Telescope | None, reason: str | None) -> str:
+def known_steps(telescope: Telescope, wavelength_angstrom: float | None) -> dict[str, str]:
+    """The sentences about the steps that help with an image of this telescope, with its published PSFs."""
+    published = published_text(telescope.name, wavelength_angstrom)
+    upload = ". ".join(filter(None, (published, telescope.ways.get("upload"))))
+    return ({"upload": upload} if published else {}) | {
+        str(way): upload if way == "upload" else sentence for way, sentence in telescope.ways.items()
+    }
+
+
+def _why(telescope: Telescope | None, reason: str | None, wavelength_angstrom: float | None) -> str:
     """The reason why the PSF is not known, and the recommended step; with a blank at the end."""
     if telescope is None:
         return f"{reason[:1].upper()}{reason[1:]}. " if reason else ""
-    recommended = next(iter(telescope.ways.values()), None)
+    recommended = next(iter(known_steps(telescope, wavelength_angstrom).values()), None)
     return f"heliopsf has no instrument file for it: {telescope.reason}. " + (
         f"{recommended}. " if recommended else ""
     )
 
 
-def _ways(telescope: Telescope | None) -> list[dict[str, str]]:
+def _ways(telescope: Telescope | None, wavelength_angstrom: float | None) -> list[dict[str, str]]:
     """The steps that the user can take next, each with what is known about this telescope."""
-    sentences = {} if telescope is None else {str(way): sentence for way, sentence in telescope.ways.items()}
+    sentences = {} if telescope is None else known_steps(telescope, wavelength_angstrom)
     return [
         one | {"text": f"{one['text']}. {sentences[one['way']]}", "known": sentences[one["way"]]}
         if one["way"] in sentences

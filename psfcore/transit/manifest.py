@@ -104,9 +104,12 @@ def read_manifest(folder: str | Path) -> TransitManifest:
     """
     path = Path(folder) / MANIFEST_NAME
     if not path.is_file():
-        raise DataError(
-            "no-manifest", f"expected a file {MANIFEST_NAME} in the folder {Path(folder).name}; add it"
+        got = (
+            f"the folder {folder} has none: add it"
+            if Path(folder).is_dir()
+            else f"{folder} is {'a file' if Path(folder).exists() else 'not there'}: name the folder of the transit"
         )
+        raise DataError("no-manifest", f"expected a folder with the file {MANIFEST_NAME}; {got}")
     with path.open("rb") as file:
         return parse_manifest(file.read(MAX_MANIFEST_BYTES + 1))
 

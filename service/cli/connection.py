@@ -15,7 +15,8 @@ from click.shell_completion import CompletionItem
 
 from psfcore.errors import did_you_mean
 from psfcore.instruments.files import instrument_names
-from psfcore.published_psfs import PUBLISHED, kept_file
+from psfcore.instruments.published import PUBLISHED
+from psfcore.published_psfs import kept_file
 from service.cli.options import LOCAL, Command, is_local, kept, options_of
 from service.cli.progress import echo, say
 from service.client.errors import DEFAULT_SERVER, SHOWN_DIGITS

@@ -62,7 +62,7 @@ from workers.contract.requests import (
 from workers.contract.suggestions import explained
 from workers.intake.costs import job_s
 from workers.lookup import no_such
-from workers.machine import cores
+from workers.machine import cores, free_bytes
 from workers.settings import Settings
 from workers.stage_timer import StageTimer
 from workers.versions import name_of_upload
@@ -218,7 +218,12 @@ class Local(Operations):
         source = workspace.psf_source(request)
         image = read_observation(workspace.image_file(image_id), LIMITS, hdu=request.hdu)
         found = convolve_image(
-            image, source, edges=edges, threads=cores(), begin=lambda stage, _: partial(report, stage)
+            image,
+            source,
+            edges=edges,
+            threads=cores(),
+            free_bytes=free_bytes(),
+            begin=lambda stage, _: partial(report, stage),
         )
         psf = found.psf
         return found, source.used or UsedPsf(request.psf_id, psf.name, psf.version, psf.status)

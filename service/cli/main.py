@@ -4,7 +4,8 @@ imported when it is called, so that ``heliopsf --version`` is fast.
 
 from __future__ import annotations
 
-import errno
+import os
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from difflib import get_close_matches
@@ -16,10 +17,11 @@ from click.shell_completion import CompletionItem
 
 from psfcore.errors import DataError, MissingExtra, missing_extra, module_of_extra
 from service.cli.first import first_screen
-from service.cli.progress import echo, printable
+from service.cli.progress import OutputClosed, echo, printable
 from service.client.errors import DEFAULT_SERVER, SHOWN_DIGITS, ServiceError, WaitInterrupted, error_lines
 
 INTERRUPTED = 130  # exit status of a command that was ended by Control-C: 128 + the number of SIGINT
+PIPE_CLOSED = 141  # that of a command whose reader ended first: 128 + the number of SIGPIPE
 REJOIN = {"job": "heliopsf job wait {id}", "bulk": "heliopsf bulk status {id} --wait"}
 NO_KEY = "this service needs a key: set HELIOPSF_KEY to your key (the operator makes keys with `heliopsf key create`)"
 _FETCH = "                      it prints the command that writes the result, such as heliopsf product get ID -o FILE\n"
@@ -94,6 +96,12 @@ class LazyGroup(click.Group):
         except KeyboardInterrupt as stop:
             echo(_interrupted(stop), err=True)
             ctx.exit(INTERRUPTED)
+        except OutputClosed:
+            # Python writes the rest of its buffers when it ends, and would tell that nobody reads them.
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            for stream in (sys.stdout, sys.stderr):
+                os.dup2(nowhere, stream.fileno())
+            ctx.exit(PIPE_CLOSED)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the commands under their headings, without importing them."""
@@ -123,8 +131,6 @@ def user_errors() -> Iterator[None]:
         local = "; or add --local, if the command has it" if missing.name == "httpx" else ""
         raise click.ClickException(f"{missing}{local}") from error
     except OSError as error:
-        if error.errno == errno.EPIPE:  # the reader of the output ended first; click ends the command
-            raise
         raise click.ClickException(str(error)) from error
 
 

@@ -30,9 +30,16 @@ def printable(text: str) -> str:
     return "".join(c if c in "\n\t" or unicodedata.category(c)[0] != "C" else ascii(c)[1:-1] for c in text)
 
 
+class OutputClosed(Exception):  # no error: the reader has read enough
+    """The reader of the output ended first, as ``head`` does after its last line."""
+
+
 def echo(text: str, *, err: bool = False) -> None:
-    """Print a line to standard output, or to standard error."""
-    click.echo(printable(text), err=err)
+    """Print a line to standard output, or to standard error. Raises `OutputClosed`."""
+    try:
+        click.echo(printable(text), err=err)
+    except BrokenPipeError as error:
+        raise OutputClosed from error
 
 
 @dataclass

@@ -171,7 +171,7 @@ class _Run:
             return Outcome(pending.image, self._products[pending.key], existed=True)
         if pending.job is None:  # the earlier image failed
             pending.job = self._submit(pending)
-        product = cast("Product", self.service.get(str(self.service.wait(pending.job)["result"])))
+        product = cast("Product", self.service.result_of(pending.job, self.service.wait(pending.job)))
         self.service.download(product["file"], pending.output, overwrite=self.overwrite)
         self.service.release(product)
         self._products[pending.key] = pending.output

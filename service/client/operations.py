@@ -514,7 +514,34 @@ class Operations(ABC):
             The errors of ``submit`` and ``wait``.
         """
         job = self.submit(kind, **parameters)
-        return self.get(str(self.wait(job, progress=progress)["result"]))
+        return self.result_of(job, self.wait(job, progress=progress))
+
+    def result_of(self, job: Submitted, ended: Ended) -> dict[str, Json]:
+        """Get the result of a job that has ended.
+
+        Parameters
+        ----------
+        job : dict
+            The job, as ``submit`` returns it.
+        ended : dict
+            The same job, as ``wait`` returns it.
+
+        Returns
+        -------
+        dict
+            The description of the result.
+
+        Raises
+        ------
+        ServiceError
+            "no-result" if the job ended without a result.
+        """
+        if ended["result"] is None:
+            raise ServiceError(
+                f"expected the address of the result of job {job['id']}; it ended without a result: submit it again",
+                code="no-result",
+            )
+        return self.get(ended["result"])
 
     @staticmethod
     def _ended(job: Job) -> Job:

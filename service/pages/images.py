@@ -20,6 +20,7 @@ from starlette.background import BackgroundTasks
 from psfcore.deconvolve.summary import region_error, steps_done
 from psfcore.fits.header import read_summary
 from psfcore.instruments.files import telescope_of, telescopes
+from psfcore.instruments.psf_statements import remarks, title
 from service.api.bulk import LOOK_FROM
 from service.api.images import delete_product, get_product_lineage, rerun_product, upload_image
 from service.api.jobs import EstimateView, estimate_job, submit_job
@@ -43,13 +44,12 @@ from service.pages.forms import (
 from service.pages.jobs import job_lines
 from service.pages.login import PageReading, PageSubmitting
 from service.pages.rendering import counted, duration, page
-from service.pages.sentences import draft, of_problem
+from service.pages.sentences import of_problem, plain, remarks_of
 from service.views import JobView, ProductView
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import ImageRow, JobRow, ProductRow, PsfRow, ReportRow
 from workers.contract.requests import Identity
 from workers.intake.compatibility import DEPRECATED_CODE, deprecation, suits
-from workers.intake.psf_choice import ChosenPsf
 from workers.intake.uploads import Upload, image_row
 from workers.lineage import Ancestor
 from workers.versions import PsfStatus
@@ -199,20 +199,27 @@ def _checked(image_id: str, asked: Sent, caller: Caller, state: State) -> dict[s
         if problem.status not in OF_OPTIONS:
             raise
         advice = (SURE,) if problem.code in TO_ALLOW else ()
-        lines = [of_problem(problem), *advice]
+        ways = [plain(one["known"]) for one in problem.more.get("ways", ()) if "known" in one]
+        lines = [of_problem(problem), *ways, *advice]
         return {"good": False, "lines": lines, "button": CHECK, "code": problem.code}
     button = OPEN if found.existing else START
-    return {"good": True, "lines": _lines(found), "button": button, "code": ""}
+    return {"good": True, "lines": _lines(found, caller.owner, state), "button": button, "code": ""}
 
 
-def _lines(found: EstimateView) -> list[str]:
+def _lines(found: EstimateView, owner: str, state: State) -> list[str]:
     assert found.psf is not None
     psf = found.psf
+    row = state.catalogue.get(PsfRow, psf.id, owner)
     why = psf.why.replace("The request names this PSF.", "You chose this PSF.")
     built = found.parameters.get("psf_recipe") is not None
-    lines = [f"{_psf(psf)}, built for {telescope_of(psf.name)}." if built else f"{_psf(psf)}. {why}"]
-    if built or psf.status == PsfStatus.DRAFT:
-        lines.append(draft(psf.name))
+    named = title(psf.name, psf.version, psf.status)
+    lines = [f"{named}, built for {telescope_of(psf.name)}." if built else f"{named}. {why}"]
+    # A PSF that is not there yet is built from a shipped instrument file or interpolated; both are drafts.
+    lines += (
+        [plain(one) for one in remarks(psf.name, psf.name, {}, PsfStatus.DRAFT)]
+        if row is None
+        else remarks_of(row)
+    )
     if found.existing:
         return [*lines, "This product exists already."]
     waiting = ""
@@ -221,11 +228,6 @@ def _lines(found: EstimateView) -> list[str]:
     seconds = found.estimate.seconds
     time = duration(seconds).capitalize() if seconds < 1 else f"About {duration(seconds)}"
     return [*lines, f"{time} and {found.estimate.memory_mib} MiB{waiting}."]
-
-
-def _psf(psf: ChosenPsf) -> str:
-    status = "" if psf.status is None else f" ({psf.status})"
-    return f"PSF {psf.name}{f' {psf.version}' if psf.version else ''}{status}"
 
 
 # --- a product ------------------------------------------------------------------------------------------

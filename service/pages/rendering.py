@@ -25,7 +25,7 @@ from service.http.callers import Caller
 from service.http.state import state_of
 from service.pages import assets
 from service.pages.forms import number_field
-from service.pages.sentences import draft, of_error, plain
+from service.pages.sentences import of_error, plain, remarks_of
 from workers.settings import software_version
 
 POLICY = (
@@ -119,7 +119,7 @@ def _environment() -> Environment:
     )
     made.globals |= {
         "asset": assets.address,
-        "draft": draft,
+        "remarks": remarks_of,
         "number_field": number_field,
         "version": software_version(),
     }

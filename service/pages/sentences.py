@@ -6,8 +6,10 @@ import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from psfcore.instruments.files import assumed_in
+from psfcore.instruments.psf_statements import remarks
 from service.http.problems import Problem
+from service.views import PsfView
+from workers.catalogue.tables import PsfRow
 from workers.lookup import NAMES
 
 # The labels in the forms, for fields whose label differs from their name.
@@ -49,10 +51,10 @@ def of_error(code: str, message: str, fields: Mapping[str, Any] = _NO_FIELDS) ->
         return plain(message)
 
 
-def draft(instrument: str | None) -> str:
-    """What it means that a PSF is a draft. instrument: the name of its instrument."""
-    assumed = assumed_in(instrument)
-    return "Draft means that nobody has certified this PSF" + (f" ({assumed})." if assumed else ".")
+def remarks_of(psf: PsfRow | PsfView) -> list[str]:
+    """What a reader must know of a PSF, as sentences."""
+    provenance = psf.details.get("provenance") or {}
+    return [plain(one) for one in remarks(psf.name, psf.instrument, provenance, psf.status)]
 
 
 def plain(message: str) -> str:

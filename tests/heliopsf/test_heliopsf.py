@@ -22,6 +22,7 @@ import matplotlib
 import numpy as np
 import pytest
 from astropy.io import fits
+from click.testing import CliRunner
 from matplotlib.figure import Figure
 
 import heliopsf
@@ -35,6 +36,7 @@ from psfcore.gap import diagnose
 from psfcore.scatter.fit import TransitFit
 from psfcore.simulate.transit import write
 from psfcore.transit.transit import Transit
+from service.cli.main import main
 from tests.conftest import write_image, write_psf
 from tests.fitted_psfs import EARLY, LATE, fitted_psf, interpolated_on_a_small_grid, write_fitted
 from tests.psfcore.small_transits import fitted, observed, sky
@@ -125,6 +127,34 @@ def test_a_psf_is_written_as_its_name_says(psf: heliopsf.Psf, tmp_path: Path) ->
     np.testing.assert_array_equal(heliopsf.read_psf(tmp_path / "psf.fits.gz").kernel, psf.kernel)
     with pytest.raises(OSError, match=r"\.fits\.gz"):
         psf.write(tmp_path / "psf.fits.fz")
+
+
+@pytest.mark.filterwarnings("ignore::psfcore.errors.DataWarning")
+def test_a_deconvolution_is_written_as_the_command_writes_it(psf: heliopsf.Psf, tmp_path: Path) -> None:
+    image, weights, written, output = (tmp_path / f"{name}.fits" for name in ("image", "psf", "mine", "out"))
+    write_image(image, WAVELNTH=171, CDELT1=2.0, CDELT2=2.0)
+    psf.write(weights)
+    result = heliopsf.deconvolve(image, weights, steps=2, noise=(5.0, 2.0), error_draws=2)
+    result.write(written)
+    options = ["--psf", str(weights), "--steps", "2", "--noise", "5", "2", "--errors", "2", "--local"]
+    told = CliRunner().invoke(main, ["deconvolve", str(image), "-o", str(output), *options])
+    assert told.exit_code == 0, told.output
+    of_request = ("PRODID", "INPSHA", "FILENAME", "HISTORY", "CHECKSUM", "DATASUM", "DATE")
+    with fits.open(written) as mine, fits.open(output) as of_command:
+        assert [one.name for one in mine] == [one.name for one in of_command]
+        for one, other in zip(mine, of_command, strict=True):
+            np.testing.assert_array_equal(one.data, other.data)
+        cards, others = (
+            {key: value for key, value in one[0].header.items() if key not in of_request}
+            for one in (mine, of_command)
+        )
+        assert cards == others and mine[0].header["FILENAME"] == "mine.fits"
+        assert set(mine[0].header["HISTORY"]) < set(of_command[0].header["HISTORY"])
+    with pytest.raises(heliopsf.DataError, match="output-exists"):
+        result.write(written)
+    result.write(written, overwrite=True)
+    with pytest.raises(heliopsf.DataError, match="already-deconvolved"):
+        heliopsf.deconvolve(written, weights)
 
 
 def test_errors_have_a_code_and_what_is_not_sure_is_a_warning(

@@ -34,6 +34,10 @@ def test_a_quantity_counts_as_the_number_in_the_documented_unit(psf: heliopsf.Ps
         heliopsf.Psf(kernel=psf.kernel, name="p", version="1", instrument=None, status="user").light_beyond(
             [2, 20] * u.arcsec
         )
+    for radius in (-3, np.nan, [1, np.inf], -1 * u.arcsec):
+        with pytest.raises(heliopsf.DataError, match=r"expected .*got") as refused:
+            psf.light_beyond(radius)
+        assert refused.value.code == "bad-radius", radius
     np.testing.assert_array_equal(heliopsf.build_psf(small_toml, size=64 * u.pix).kernel, psf.kernel)
     before, time, after = (Time(f"{year}-03-01T12:00:00") for year in (2023, 2024, 2025))
     with pytest.raises(heliopsf.DataError, match="psf-not-fitted"):
@@ -95,8 +99,8 @@ def test_a_psf_may_be_named_by_its_instrument(small_toml: Path, psf: heliopsf.Ps
 def test_results_show_themselves_in_two_lines_and_with_a_picture(psf: heliopsf.Psf) -> None:
     result = heliopsf.deconvolve(a_map(), psf, full=True, steps=2)
     for shown, words in (
-        (psf, ("small", "draft", "171 angstrom", "64 x 64 px", "diffraction")),
-        (result, ("SMALL_1 2024-03-01", "PSF small", "without diffuse scatter", "128 x 96 px", "2 steps")),
+        (psf, ("small", "draft", "171 angstrom", "64 x 64 px", "diffraction", "scattered light stays")),
+        (result, ("SMALL_1 2024-03-01", "PSF small", "scattered light stays", "128 x 96 px", "2 steps")),
     ):
         text = repr(shown)
         assert len(text.splitlines()) == 2 and len(text) < 400

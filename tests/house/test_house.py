@@ -128,6 +128,7 @@ LIGHT = (
     "psfcore.fits.stored_psf",
     "psfcore.fits.viewing",  # its modules of pixels are loaded by the first request for pixels
     "psfcore.instruments.files",
+    "psfcore.instruments.psf_statements",
     "psfcore.limited",
     "psfcore.tables.lookup",
     "psfcore.errors",

@@ -14,7 +14,6 @@ from astropy.io import fits
 from psfcore import build
 from psfcore import psf as psf_module
 from psfcore.build import build_psf
-from psfcore.deconvolve.summary import assumptions
 from psfcore.diffraction import combined
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits
@@ -32,6 +31,7 @@ from psfcore.instruments.model import (
     load_instrument,
     parse_instrument,
 )
+from psfcore.instruments.psf_statements import assumptions
 from psfcore.psf import Psf, cumulative_curve, squared_radii
 from psfcore.psf_sampling import psf_for_image
 from psfcore.scatter.power_law import amplitude_for_total, described_kernel, scatter_kernel
@@ -243,7 +243,7 @@ def test_a_sector_and_a_hexagonal_mesh_are_built_by_both_routes(small_reach: Non
     assert "pattern of the edges" in of_edges.provenance["entrance_route"]
     assert (
         psf.provenance["mesh_basis"] == "assumed"
-        and assumptions(psf.provenance)[0] == "mesh of the filter assumed"
+        and assumptions(psf.name, psf.instrument, psf.provenance)[0] == "mesh of the filter assumed"
     )
     beyond = [cumulative_curve(one.components["AIRY"], [0.5, 5.5]) for one in (psf, of_edges)]
     # The light that edges diffract is proportional to their length divided by the area.

@@ -15,7 +15,8 @@ from astropy.io import fits
 
 from psfcore.errors import DataError
 from psfcore.fits.psfs import read_psf
-from psfcore.published_psfs import LIMITS, PUBLISHED, get, kept_file
+from psfcore.instruments.published import PUBLISHED
+from psfcore.published_psfs import LIMITS, get, kept_file
 from tests.published_server import CHECKSUM, NAME, SIZE_PX, answer, published_fits, stand_in
 
 

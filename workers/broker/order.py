@@ -175,6 +175,13 @@ class FolderTransport(filesystem.Transport):
 
     Channel = _FolderChannel
 
+    @property
+    def default_connection_params(self) -> dict[str, object]:
+        """None: a folder has neither host nor port. Kombu's own version names localhost, and warns that no host was
+        given.
+        """
+        return {}
+
     def drain_events(self, connection: Any, timeout: float | None = None, **_: Any) -> None:
         """Deliver one message. Raises ``TimeoutError`` if no message arrives in time, or at once if the worker must
         stop.

@@ -16,6 +16,7 @@ from pydantic import BaseModel, Field
 
 from psfcore.errors import DataError
 from psfcore.instruments.model import load_instrument
+from psfcore.instruments.psf_statements import version_text
 from psfcore.instruments.unknown import agreement, unknown_instrument
 from psfcore.instruments.unknown import channel_of as channel_of_image
 from workers.catalogue.catalogue import Catalogue
@@ -232,7 +233,7 @@ class ChosenPsf(BaseModel):
     id: str
     name: str
     version: str = Field(
-        description="version of the PSF; if the PSF is not built yet: version of its instrument file"
+        description="version of the PSF; if it is not built yet: the version that it will have"
     )
     status: str | None = Field(description="draft, certified or deprecated; null: the PSF is not built yet")
     why: str = Field(description="a sentence that says why this PSF was chosen")
@@ -258,7 +259,8 @@ def reasoned_psf(
         # resolve() has found the image and the PSF, or the recipe of the PSF
         assert resolved.psf_recipe is not None and resolved.psf_recipe.instrument is not None
         instrument = load_instrument(resolved.psf_recipe.instrument)
-        name, version = instrument.name, instrument.version
+        name = instrument.name
+        version = version_text(instrument.version, instrument.status, resolved.psf_id)
         why = _why_built(wanted, catalogue, owner) + "; the job builds it first."
     return ChosenPsf(id=resolved.psf_id, name=name, version=version, status=None, why=why)
 

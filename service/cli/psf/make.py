@@ -9,6 +9,7 @@ from typing import Any
 
 import click
 
+from psfcore.instruments.psf_statements import caveats, title
 from service.cli.connection import SERVER_OR_LOCAL, connection, short
 from service.cli.options import (
     FILE,
@@ -60,7 +61,7 @@ def build(
             progress=report,
             **parameters,
         )
-    echo(f"{output}: {built['name']} {built['version']} ({built['status']}), id {short(built['id'])}")
+    echo(f"{output}: {title(built['name'], built['version'], built['status'])}, id {short(built['id'])}")
     for radius, beyond_pct in built["details"]["cumulative_curve_pct"].items():
         echo(f"  light beyond {radius:>5} px  {beyond_pct:6.2f} %")
 
@@ -94,7 +95,7 @@ def fit(
             **parameters,
         )
     found = fitted["details"]["fit"]
-    echo(f"{output}: {fitted['name']} {fitted['version']} ({fitted['status']}), id {short(fitted['id'])}")
+    echo(f"{output}: {title(fitted['name'], fitted['version'], fitted['status'])}, id {short(fitted['id'])}")
     say_fit(found)
     for limit in found["limits"]:
         echo(f"  note: {limit}")
@@ -160,11 +161,13 @@ def show(file: Path, plot: Path | None, overwrite: bool) -> None:
     radii = np.array([r for r in SHOWN_RADII_PX if r < psf.reach_px])
     kernels = {"TOTAL": psf.kernel, **psf.components}
     curves = {name: cumulative_curve(kernel, radii) for name, kernel in kernels.items()}
-    echo(f"{psf.name} {psf.version} ({psf.status}), instrument {psf.instrument or 'unnamed'}")
+    echo(f"{title(psf.name, psf.version, psf.status)}, instrument {psf.instrument or 'unnamed'}")
     echo(
         f"{psf.kernel.shape[1]} x {psf.kernel.shape[0]} px, reach {psf.reach_px:.0f} px, sum {psf.kernel.sum():.6f}, "
         f"central pixel {psf.kernel.max():.4f}, plate scale {psf.plate_scale_arcsec or 'unknown'} arcsec/px"
     )
+    for caveat in caveats(psf.name, psf.instrument, psf.provenance):
+        echo(caveat)
     echo("\nlight beyond R, or outside the array, in percent:")
     echo(f"{'R (px)':>8}" + "".join(f"{name:>15}" for name in kernels))
     for n, radius in enumerate(radii):

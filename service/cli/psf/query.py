@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from psfcore.published_psfs import PUBLISHED, get, published
+from psfcore.instruments.published import PUBLISHED
+from psfcore.published_psfs import get, published
 from psfcore.tables import lookup
 from service.cli.connection import ID_OR_FILE, SERVER_FOR_IDS, is_psf_id, psf_file, remote, short, whole_id
 from service.cli.options import (

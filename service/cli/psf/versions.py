@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict, cast
 
 import click
 
+from psfcore.instruments.psf_statements import title
 from service.cli.connection import (
     CONTEXT,
     ID,
@@ -120,7 +121,7 @@ def download(
     for part, path in (("file", file), ("preview", plot), ("report", json_file)):
         if path is not None:
             service.download(f"/v1/psfs/{row['id']}/{part}", path, overwrite=overwrite)
-    echo(f"{file}: PSF {short(row['id'])}, {row['name']} {row['version']} ({row['status']})")
+    echo(f"{file}: {title(row['name'], row['version'], row['status'])}, id {short(row['id'])}")
 
 
 @click.command("instruments")

@@ -12,8 +12,10 @@ from astropy.io.fits import Header
 
 from psfcore.convolution.engine import Engine
 from psfcore.deconvolve.conditions import Conditions, PreparedPsfs, new_engine
-from psfcore.deconvolve.memory import MIB, Demand, check_memory, deconvolution_bytes
+from psfcore.deconvolve.forward import convolve_image
+from psfcore.deconvolve.memory import MIB, Demand, check_memory, convolution_bytes, deconvolution_bytes
 from psfcore.deconvolve.methods.registry import method_named, method_names
+from psfcore.deconvolve.run import PsfSource
 from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits
 from psfcore.fits.psfs import read_psf
@@ -59,6 +61,17 @@ def test_more_pixels_need_more_memory_and_what_does_not_fit_is_refused() -> None
     for text in ("2048 x 4096 px", "101 MiB", "100 MiB", "region"):
         assert text in refused.value.message
     assert refused.value.fields == {"needed_mib": 101, "free_mib": 100}
+    small = convolution_bytes((1024, 1024), (2048, 2048), "zero")
+    assert convolution_bytes((1024, 1024), (64, 64), "zero") < small - 32e6
+    assert small < convolution_bytes((1024, 1024), (2048, 2048), "symmetric") - 20e6
+
+
+def test_a_convolution_that_does_not_fit_is_refused_before_its_psf_is_built() -> None:
+    source = PsfSource(lambda *_: pytest.fail("the PSF is built"), lambda *_: ())
+    with pytest.raises(DataError) as refused:
+        convolve_image(make_image(np.full((64, 64), 5.0)), source, free_bytes=MIB)
+    assert refused.value.code == "too-much-memory" and refused.value.fields["free_mib"] == 1
+    assert "convolution" in refused.value.message and "region" not in refused.value.message
 
 
 def test_a_psf_is_read_once_and_a_binned_image_gets_the_psf_of_its_pixels_once(psf_file: Path) -> None:

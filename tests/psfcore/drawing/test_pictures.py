@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from psfcore.drawing import plots, thumbnail
-from psfcore.drawing.plots import GOLD, preview_png, psf_png, write_png
+from psfcore.drawing.plots import GOLD, curves_of, preview_png, psf_figure, psf_png, write_png
 from psfcore.drawing.thumbnail import (
     DECADES,
     EUV_POINTS,
@@ -207,3 +207,15 @@ def test_every_picture_is_written_by_the_function_that_draws_names_as_they_are()
         if path != here and re.search(r"print_png|savefig|FigureCanvasAgg", path.read_text("utf-8"))
     ]
     assert wrong == []
+
+
+def test_curves_that_coincide_are_drawn_once_and_named_together() -> None:
+    weights, wide = gaussian(33, 1.5), gaussian(33, 4.0)
+    psf = dataclasses.replace(
+        make_psf(weights), components={"ENTRANCE_MESH": wide, "ENTRANCE": wide.copy(), "DIFFRACTION": weights}
+    )
+    assert list(curves_of(psf)) == [("ENTRANCE_MESH", "ENTRANCE"), ("TOTAL", "DIFFRACTION")]
+    figure = psf_figure(psf)
+    named = {text.get_text() for text in figure.legends[0].get_texts()}
+    assert named == {"Total, diffraction", "Entrance mesh, entrance"}
+    assert [len(axes.lines) for axes in figure.axes[1:3]] == [2, 2]

@@ -12,7 +12,6 @@ from psfcore.errors import DataError
 from psfcore.fits.header import known_instrument
 from psfcore.instruments import files
 from psfcore.instruments.files import (
-    assumed_in,
     instrument_names,
     instrument_path,
     match_instrument,
@@ -23,12 +22,10 @@ from psfcore.instruments.model import Instrument, Mesh, SpectralLine, load_instr
 from tests.conftest import SMALL_INSTRUMENT
 
 
-def test_every_shipped_instrument_loads_under_its_own_name_and_a_draft_says_what_it_assumes() -> None:
+def test_every_shipped_instrument_loads_under_its_own_name() -> None:
     for name in instrument_names():
         instrument = load_instrument(name)
         assert instrument.name == name
-        assert (assumed_in(name) is not None) == (instrument.status == "draft")
-    assert assumed_in("none") is None and assumed_in(None) is None
     hri = load_instrument("hri_euv")
     assert hri.mount is not None and (hri.mount.basis, hri.status) == ("assumed", "draft")
     assert telescopes() == {

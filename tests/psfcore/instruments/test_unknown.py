@@ -13,6 +13,7 @@ from astropy.io.fits import Header, PrimaryHDU
 from psfcore.errors import DataError
 from psfcore.fits.blocks import LIMITS
 from psfcore.fits.header import read_summary, seen_by
+from psfcore.instruments.published import published_for
 from psfcore.instruments.unknown import TELESCOPES, WAYS, telescope_without_file, unknown_instrument
 
 SUVI = "GOES-R Series Solar Ultraviolet Imager"
@@ -60,7 +61,9 @@ def test_the_error_names_the_telescope_the_reason_and_the_step() -> None:
         assert list(texts) == ["name", "upload", "fit"]
         for way, sentence in telescope.ways.items():
             assert texts[way].endswith(sentence)
-            assert sentence in [one.get("known") for one in error.fields["ways"]]
+            assert any(one.get("known", "").endswith(sentence) for one in error.fields["ways"])
+        for published in published_for(name, seen_by(Header(cards))["wavelnth"]):
+            assert published.name in texts["upload"], cards
         for recommended in list(telescope.ways.values())[:1]:
             assert recommended in error.message
     for cards in OTHERS:

@@ -115,8 +115,12 @@ def test_a_wrong_value_is_named_and_other_content_is_refused() -> None:
 
 
 def test_a_folder_without_a_manifest_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="no-manifest"):
-        read_manifest(tmp_path)
+    file = tmp_path / "image.fits"
+    file.touch()
+    for place, fault in ((tmp_path, "has none"), (file, "is a file"), (tmp_path / "no", "is not there")):
+        with pytest.raises(DataError, match=f"{place.name} {fault}") as refused:
+            read_manifest(place)
+        assert refused.value.code == "no-manifest"
 
 
 def test_plain_names() -> None:

@@ -135,7 +135,7 @@ def test_the_psf_of_an_instrument_may_be_named(folder: Path, monkeypatch: pytest
     file.write_text(SMALL_INSTRUMENT)
     done = run("deconvolve", image, "-o", folder / "o.fits", "--steps", 1, "--psf", file, "--local")
     assert done.exit_code == 0 and "PSF small 1.0.0" in done.output, done.output
-    assert "draft: without diffuse scatter" in done.output
+    assert "scattered light stays" in done.output
     assert fits.getheader(folder / "o.fits")["PSFNAME"] == "small"
     done = run("deconvolve", image, "-o", folder / "n.fits", "--psf", "aia171", "--local")
     assert done.exit_code == 2 and "'aia_171'" in done.output

@@ -4,6 +4,7 @@ Tab completion without imports, and Control-C."""
 from __future__ import annotations
 
 import json
+import os
 import shlex
 import subprocess
 import sys
@@ -15,7 +16,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from service.cli.main import Lazy, LazyGroup, main
+from service.cli.main import Lazy, LazyGroup, main, user_errors
 from service.client.errors import WaitInterrupted
 from tests.conftest import write_image
 
@@ -156,3 +157,17 @@ def test_control_c_ends_with_status_130_and_says_how_to_go_on(monkeypatch: pytes
         done = CliRunner().invoke(group, ["one"])
         assert done.exit_code == 130
         assert all(line in done.stderr for line in told), done.stderr
+
+
+def test_a_reader_that_ends_first_ends_the_command_quietly() -> None:
+    """The status is that of a command which SIGPIPE ended. A service that breaks its connection is another matter."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    script = "from service.cli.main import main; main(['psf', 'published'])"
+    done = subprocess.run(  # our own script
+        [sys.executable, "-c", script], stdout=writing, stderr=subprocess.PIPE, text=True, check=False
+    )
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (141, "")
+    with pytest.raises(click.ClickException), user_errors():
+        raise BrokenPipeError

@@ -62,6 +62,12 @@ def service(request: pytest.FixtureRequest) -> Iterator[Operations]:
             yield here
 
 
+def test_a_job_without_a_result_is_told(service: Operations) -> None:
+    with pytest.raises(ServiceError) as told:
+        service.result_of({"id": "9" * 32, "kind": "deconvolve"}, {"result": None})
+    assert told.value.code == "no-result" and "9" * 32 in str(told.value)
+
+
 @pytest.fixture
 def run(service: Operations, tmp_path: Path) -> Run:
     write_psf(tmp_path / "psf.fits")

@@ -55,12 +55,13 @@ def checked(api: TestClient, image_id: str, **options: str) -> list[str]:
 
 def test_an_image_without_a_psf_is_told_so(api: TestClient, tmp_path: Path) -> None:
     xrt = image(api, tmp_path, **XRT)
-    (line,) = checked(api, xrt)
+    line, upload_one, _ = checked(api, xrt)
     assert (
         line.startswith("No PSF for Hinode/XRT is known here: ")
         and "mirrors" in line
         and "Upload a PSF here" in line
     )
+    assert "xrt_560ev_2017" in upload_one and "xrt_1kev_2017" in upload_one, "as the command names them"
     page = api.get(f"/images/{xrt}").text
     assert "none: choose a PSF" in page and "chosen for this image" not in page
     assert "2012-06-05T22:00:00.123" in page
@@ -69,9 +70,10 @@ def test_an_image_without_a_psf_is_told_so(api: TestClient, tmp_path: Path) -> N
 
 def test_an_error_plane_needs_no_figures_and_the_form_takes_them(api: TestClient, tmp_path: Path) -> None:
     hri = image(api, tmp_path, **HRI)
-    assert checked(api, hri, error_draws="8")[0].startswith("PSF hri_euv 0.2.0, built for")
+    before = checked(api, hri, error_draws="8")[0]
+    assert re.match(r"PSF hri_euv 0\.2\.0-draft\+[0-9a-f]{8}, built for", before)
     figures = {"photon_gain_dn": "4", "read_noise_dn": "1.5"}
-    assert checked(api, hri, error_draws="8", **figures)[0].startswith("PSF hri_euv 0.2.0, built for")
+    assert checked(api, hri, error_draws="8", **figures)[0] == before
     sent = api.post(f"/images/{hri}/start", data={"error_draws": "8", **figures}, follow_redirects=False)
     job = api.get(f"/v1{sent.headers['location']}").json()
     assert job["parameters"]["noise"] == {"photon_gain_dn": 4.0, "read_noise_dn": 1.5}

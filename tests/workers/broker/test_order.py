@@ -156,6 +156,14 @@ def test_the_folder_s_messages_come_in_our_order(catalogue: Catalogue, settings:
     assert len(set(taken)) == AT_ONCE + 12
 
 
+def test_the_folder_has_no_host_of_which_the_log_could_warn(
+    settings: Settings, caplog: pytest.LogCaptureFixture
+) -> None:
+    with queue.make_app(settings).connection_for_read() as connection:
+        connection.clone().ensure_connection(max_retries=1)
+    assert caplog.messages == []
+
+
 def test_what_was_cut_in_the_folder_when_the_power_went_stops_nobody(settings: Settings) -> None:
     broker = settings.data_dir / "broker"
 

@@ -14,7 +14,7 @@ from fastapi.testclient import TestClient
 
 import heliopsf
 from psfcore.errors import DataError
-from psfcore.published_psfs import PUBLISHED
+from psfcore.instruments.published import PUBLISHED
 from service.cli.main import main
 from service.client.http import Client
 from tests.conftest import SMALL_INSTRUMENT, write_image

@@ -1,0 +1,64 @@
+"""What is said of a PSF, in one place: title, version, assumptions, scatter, and published PSFs."""
+
+from __future__ import annotations
+
+from psfcore.instruments.files import instrument_names, telescope_of
+from psfcore.instruments.model import load_instrument
+from psfcore.instruments.psf_statements import (
+    assumptions,
+    caveats,
+    mesh_is_assumed,
+    published_text,
+    remarks,
+    scatter_left,
+    title,
+    version_text,
+)
+from psfcore.instruments.published import PUBLISHED, published_for
+from psfcore.instruments.unknown import TELESCOPES
+
+
+def test_every_shipped_draft_says_what_it_assumes_and_what_scatter_it_leaves() -> None:
+    for name in instrument_names():
+        instrument = load_instrument(name)
+        left = scatter_left(name, name, {})
+        assert bool(assumptions(name, name, {})) == (instrument.status == "draft")
+        assert (left is None) == (instrument.scatter is not None)
+        assert left is None or ("10 to 35 %" in left) == (telescope_of(name) == "SDO/AIA"), name
+        assert mesh_is_assumed(name, name, {}) == any(mesh.basis == "assumed" for mesh in instrument.meshes)
+
+
+def test_other_psfs_say_what_their_provenance_does() -> None:
+    assumed = {"mount_basis": "assumed", "mesh_basis": "assumed", "scatter_basis": "inferred"}
+    assert [len(caveats("mine", "mine", one)) for one in ({}, {"mount_basis": "none"}, assumed)] == [0, 1, 3]
+    left = scatter_left("mine", "mine", {"mount_basis": "drawing"})
+    assert left is not None and "%" not in left, "the share of another telescope is not known"
+    for name, provenance in (
+        ("aia_171_2025", {}),
+        ("mine", {"mount_basis": "none", "scatter_basis": "fitted"}),
+    ):
+        assert scatter_left(name, "aia_171", provenance) is None, name
+    assert scatter_left("hri_euv", "hri_euv", {"component": "DIFFRACTION"}) is not None
+    changed = {
+        "mount_basis": "drawing",
+        "mesh_basis": "assumed",
+    }  # a copy of the shipped file, under its name
+    assert assumptions("hri_euv", "hri_euv", changed) == ["mesh of the filter assumed"]
+    assert mesh_is_assumed("hri_euv", "hri_euv", changed)
+    assert len(remarks("mine", None, {}, "draft")) == 1 and remarks("mine", None, {}, "certified") == []
+
+
+def test_title_and_version() -> None:
+    assert title("aia_171", "1.0.0", "certified") == "PSF aia_171 1.0.0 (certified)"
+    assert title("aia_171", "", None) == "PSF aia_171"
+    assert version_text("0.2.0", "draft", "0003662b" + "0" * 56) == "0.2.0-draft+0003662b"
+    assert version_text("1.0.0", "released") == "1.0.0"
+
+
+def test_the_published_psfs_of_a_telescope_are_named_for_its_channel() -> None:
+    text = published_text("Hinode/XRT", None)
+    assert text is not None and "xrt_560ev_2017" in text and "xrt_1kev_2017" in text
+    assert [one.name for one in published_for("SDO/AIA", 171.1)] == ["aia_171_2025"]
+    assert published_text("SDO/AIA", 1600.0) is None and published_text("TRACE", 171.0) is None
+    by_hand = [name for name in PUBLISHED for one in TELESCOPES if name in str(one.ways)]
+    assert by_hand == [], "the table names them"
