@@ -9,12 +9,14 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from difflib import get_close_matches
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import click
 from click.shell_completion import CompletionItem
 
 from psfcore.errors import DataError, MissingExtra, missing_extra, module_of_extra
+from service.cli.first import first_screen
 from service.cli.progress import OutputClosed, echo, printable
 from service.client.errors import DEFAULT_SERVER, SHOWN_DIGITS, ServiceError, WaitInterrupted, error_lines
 
@@ -224,15 +226,19 @@ PSF_SECTIONS = {
 @click.group(
     cls=LazyGroup,
     sections=SECTIONS,
+    invoke_without_command=True,
     context_settings={"help_option_names": ["-h", "--help"], "show_default": True},
 )
 @click.version_option(None, "-V", "--version", package_name="heliopsf", prog_name="heliopsf")
-def main() -> None:
+@click.pass_context
+def main(ctx: click.Context) -> None:
     """Determine the point-spread functions (PSFs) of solar EUV telescopes, and deconvolve images.
 
     Most commands need a service (option --server), which `heliopsf serve` starts, or run here with --local:
     heliopsf COMMAND -h
     """
+    if ctx.invoked_subcommand is None:
+        echo(first_screen(Path.cwd()))
 
 
 @click.group(cls=LazyGroup, sections=PSF_SECTIONS)

@@ -17,7 +17,7 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import JSONResponse, RedirectResponse
 from starlette.background import BackgroundTasks
 
-from psfcore.deconvolve.summary import steps_done
+from psfcore.deconvolve.summary import region_error, steps_done
 from psfcore.fits.header import read_summary
 from psfcore.instruments.files import telescope_of, telescopes
 from psfcore.instruments.psf_statements import remarks, title
@@ -51,6 +51,7 @@ from workers.catalogue.tables import ImageRow, JobRow, ProductRow, PsfRow, Repor
 from workers.contract.requests import Identity
 from workers.intake.compatibility import DEPRECATED_CODE, deprecation, suits
 from workers.intake.uploads import Upload, image_row
+from workers.lineage import Ancestor
 from workers.versions import PsfStatus
 
 SAMPLE = "sample.fits"
@@ -273,6 +274,34 @@ def product(product_id: Identity, request: Request, caller: PageReading, state: 
         soon.add_task(prepare_image, state, image.owner, image.id)
     answer.background = soon
     return answer
+
+
+@in_turn(products.get("/print"))
+def report(product_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
+    """The product on one sheet A4: image, PSF and its sources, method, what was masked and what changed."""
+    row = state.row(ProductRow, product_id, caller.owner)
+    image = state.catalogue.get(ImageRow, row.image_id, row.owner)
+    psf = state.catalogue.get(PsfRow, row.psf_id, row.owner)
+    parents = get_product_lineage(product_id, caller, state).parents
+    return page(
+        request,
+        "print.html",
+        product=ProductView.of(row),
+        name=(image and image.filename) or row.details["filename"],
+        image=image,
+        deprecated=None if psf is None else deprecation(state.catalogue, psf),
+        sources=[source for parent in parents if parent.type == "psf" for source in _ancestors(parent)],
+        steps=steps_done(row.details),
+        region_error=region_error,
+    )
+
+
+def _ancestors(thing: Ancestor) -> list[Ancestor]:
+    """Everything that a thing was made from, each once, the nearest first."""
+    found: dict[str, Ancestor] = {}
+    for parent in thing.parents:
+        found |= {one.id: one for one in (parent, *_ancestors(parent)) if one.id not in found}
+    return list(found.values())
 
 
 @in_turn(products.post("/rerun"))

@@ -5,9 +5,11 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from types import SimpleNamespace
 
 import click
@@ -16,6 +18,7 @@ from click.testing import CliRunner
 
 from service.cli.main import Lazy, LazyGroup, main, user_errors
 from service.client.errors import WaitInterrupted
+from tests.conftest import write_image
 
 HEAVY = {
     "astropy",
@@ -73,15 +76,43 @@ def test_a_misspelt_command_is_answered_with_the_close_one() -> None:
     assert "Did you mean" not in unknown.output
 
 
-def test_version_and_help_load_nothing_heavy() -> None:
+def test_without_arguments_up_to_three_commands_fit_the_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+
+    def commands_shown() -> list[list[str]]:
+        shown = CliRunner().invoke(main, [])
+        assert shown.exit_code == 0, shown.output
+        return [shlex.split(line)[1:6] for line in shown.output.splitlines() if line.startswith("  heliopsf")]
+
+    assert [row[0] for row in commands_shown()] == ["demo", "serve", "deconvolve"]
+    write_image(tmp_path / "a psf.fits", PSFSUM=1.0)
+    (tmp_path / "notes.txt").write_text("no image")
+    assert commands_shown()[0][0] == "demo", "a PSF is not an image"
+    write_image(tmp_path / "an image.fits")
+    one = ["deconvolve", "an image.fits", "-o", "an image-deconvolved.fits", "--local"]
+    assert commands_shown() == [one]
+    (tmp_path / "many").mkdir()
+    for number in range(3):
+        write_image(tmp_path / "many" / f"{number}.fits")
+    assert commands_shown() == [one, ["deconvolve", "many", "-o", "deconvolved/", "--local"]]
+    (tmp_path / "mercury").mkdir()
+    (tmp_path / "mercury" / "transit.json").write_text("{}")
+    write_image(tmp_path / "mercury" / "0.fits")
+    assert [row[:2] for row in commands_shown()] == [["report", "mercury"], ["gap", "mercury"], one[:2]]
+
+
+def test_version_help_and_no_arguments_load_nothing_heavy() -> None:
     script = (
         "import sys, json, atexit\n"
         "atexit.register(lambda: print(json.dumps(sorted(sys.modules))))\n"
         "from service.cli.main import main\n"
         "main(sys.argv[1:])\n"
     )
-    for option, said in (("-V", "heliopsf, version "), ("--help", "Usage:")):
-        command = [sys.executable, "-c", script, option]
+    cases: list[tuple[list[str], str]] = [(["-V"], "heliopsf, version "), (["--help"], "Usage:"), ([], "")]
+    for options, said in cases:
+        command = [sys.executable, "-c", script, *options]
         done = subprocess.run(command, check=True, capture_output=True, text=True)
         loaded = set(json.loads(done.stdout.splitlines()[-1]))
         assert done.stdout.startswith(said) and "service.cli.main" in loaded and loaded & HEAVY == set()

@@ -54,6 +54,7 @@ def pages(site: Site, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str
         "/jobs": NAME,
         f"/jobs/{job}": "All parameters",
         f"/products/{product['id']}": NAME,
+        f"/products/{product['id']}/print": f"Deconvolution of {NAME}",
         "/psfs": NAME,
         f"/psfs/{psf}": NAME,
         f"/psfs/{psf}/products": NAME,

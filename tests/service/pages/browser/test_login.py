@@ -170,3 +170,20 @@ def test_forms_work_over_http_where_browsers_do_not_name_the_site(
     assert len(sent) == 2 and all("sec-fetch-site" not in headers for headers in sent)
     assert {headers["origin"] for headers in sent} == {address}
     page.close()
+
+
+def test_the_first_page_of_a_new_person_shows_the_sample_before_and_after(page: Page, key: str) -> None:
+    page.goto("/login")
+    log_in(page, key)
+    divider = page.get_by_role("slider", name="Divider between before and after")
+    after = page.get_by_alt_text("The sample image after the deconvolution")
+    expect(after).to_have_css("clip-path", "inset(0px 0px 0px 50%)")
+    good(page)
+    divider.press("Home")  # the keyboard
+    expect(after).to_have_css("clip-path", "inset(0px 0px 0px 0%)")
+    page.locator("#sample .halves").click(position={"x": 5, "y": 100})  # the pointer
+    assert 0 < float(divider.input_value()) < 5
+    page.get_by_role("button", name="Use this sample").click()
+    expect(page.get_by_role("heading", level=1)).to_have_text("sample.fits")
+    page.goto("/")
+    expect(page.locator("#sample")).to_have_count(0)

@@ -179,3 +179,22 @@ def test_a_failed_job_says_why_and_what_to_do(
     row = page.locator(f"[data-job='{job['id']}']")
     expect(row).to_contain_text("dark.fits")
     expect(row).to_contain_text(message[1:])
+
+
+def test_the_report_of_a_product_prints_on_one_sheet(page: Page, site: Site, product: Looked) -> None:
+    row = site.client.get(f"/v1/products/{product.id}")
+    page.goto(product.page)
+    page.get_by_role("link", name="Report on one page").click()
+    main = page.locator("main")
+    for told in (
+        product.image_id,
+        row["psf_id"],
+        row["sha256"],
+        f"{row['details']['flux_change_pct']:+.3g} %",
+    ):
+        expect(main).to_contain_text(told)
+    good(page)
+    sheets = page.pdf(prefer_css_page_size=True)
+    assert len(re.findall(rb"/Type\s*/Page\b", sheets)) == 1
+    page.emulate_media(media="print")
+    expect(page.get_by_role("navigation")).to_be_hidden()
