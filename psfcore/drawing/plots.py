@@ -26,7 +26,7 @@ from matplotlib.ticker import FixedFormatter, FuncFormatter, MaxNLocator
 from numpy.typing import NDArray
 
 from psfcore.drawing.thumbnail import EUV_POINTS, NO_DATA, block_means
-from psfcore.instruments.psf_statements import title
+from psfcore.instruments.psf_statements import curves_once, title
 from psfcore.psf import REACH_GRID_PX, Kernel, Psf, crop_centred, cumulative_curve, radial_profile
 
 PANEL_PX = 640
@@ -239,15 +239,8 @@ def psf_figure(psf: Psf) -> Figure:
 
 
 def curves_of(psf: Psf) -> dict[tuple[str, ...], Kernel]:
-    """The weights whose curves a figure shows, by their names: "TOTAL" and the components. Equal weights are one curve
-    with several names, because curves that coincide hide each other.
-    """
-    curves: dict[tuple[str, ...], Kernel] = {}
-    for name, kernel in {"TOTAL": psf.kernel, **psf.components}.items():
-        same = next((names for names, one in curves.items() if np.array_equal(one, kernel)), ())
-        curves.pop(same, None)
-        curves[(*same, name)] = kernel
-    return curves
+    """The weights whose curves a figure shows, by their names: "TOTAL" and the components."""
+    return curves_once({"TOTAL": psf.kernel, **psf.components}, np.array_equal)
 
 
 def curve_label(names: Sequence[str]) -> str:

@@ -12,12 +12,14 @@ This module imports no numerical library, so that the web process can import it.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import TypeVar
 
 from psfcore.instruments.files import instrument_names, instrument_path, telescope_of
 from psfcore.instruments.model import Instrument, load_instrument
 from psfcore.instruments.published import published_for
 
+Curve = TypeVar("Curve")
 DRAFT = "draft"
 # The light that a telescope scatters diffusely, for shipped instrument files without scatter. The files themselves do
 # not contain it, because their text is part of the ids of PSFs.
@@ -99,6 +101,20 @@ def published_text(telescope: str, wavelength_angstrom: float | None) -> str | N
         return None
     named = ", ".join(f"{one.name} ({one.channel})" for one in found)
     return f"Published PSFs of {telescope}: {named}; `heliopsf psf get NAME` brings one as a file"
+
+
+def curves_once(
+    curves: Mapping[str, Curve], same: Callable[[Curve, Curve], bool]
+) -> dict[tuple[str, ...], Curve]:
+    """The curves that a figure of a PSF shows, each with its names: curves that are the same hide each other, and
+    become one.
+    """
+    once: dict[tuple[str, ...], Curve] = {}
+    for name, curve in curves.items():
+        names = next((names for names, other in once.items() if same(curve, other)), ())
+        once.pop(names, None)
+        once[(*names, name)] = curve
+    return once
 
 
 def _bases(name: str, instrument: str | None, provenance: Mapping[str, object]) -> Mapping[str, object]:

@@ -7,6 +7,7 @@ from psfcore.instruments.model import load_instrument
 from psfcore.instruments.psf_statements import (
     assumptions,
     caveats,
+    curves_once,
     mesh_is_assumed,
     published_text,
     remarks,
@@ -62,3 +63,9 @@ def test_the_published_psfs_of_a_telescope_are_named_for_its_channel() -> None:
     assert published_text("SDO/AIA", 1600.0) is None and published_text("TRACE", 171.0) is None
     by_hand = [name for name in PUBLISHED for one in TELESCOPES if name in str(one.ways)]
     assert by_hand == [], "the table names them"
+
+
+def test_curves_that_are_the_same_are_one_with_all_names() -> None:
+    curves = {"TOTAL": [1.0, 0.5], "AIRY": [1.0, 0.2], "DIFFRACTION": [1.0, 0.5]}
+    once = curves_once(curves, lambda one, other: one == other)
+    assert once == {("AIRY",): [1.0, 0.2], ("TOTAL", "DIFFRACTION"): [1.0, 0.5]}
