@@ -28,6 +28,7 @@ from psfcore.evaluation.evaluation import Evaluation, evaluate
 from psfcore.evaluation.report import report as evaluation_json
 from psfcore.evaluation.report import sentence
 from psfcore.evaluation.shapes import held_out_kernels
+from psfcore.instruments.psf_statements import title
 from psfcore.psf import PLATE_SCALE_TOLERANCE, REACH_GRID_PX, Psf
 from psfcore.scatter.fit import TransitFit, fit_json, fit_transit, fitted_psf
 from psfcore.scatter.inversion import Inverter
@@ -110,7 +111,7 @@ class PsfReport:
         judged = sentence(self.evaluation)
         if self.fit is not None:
             return str(fit_json(self.fit)["sentence"] + f" {self.how_judged}. {judged}")
-        return f"PSF {self.psf.name} {self.psf.version}. {self.how_judged}. {judged}"
+        return f"{title(self.psf.name, self.psf.version, None)}. {self.how_judged}. {judged}"
 
     @property
     def how_judged(self) -> str:

@@ -22,6 +22,7 @@ from psfcore.convolution.convolver import Convolver
 from psfcore.errors import DataError
 from psfcore.fits.images import write_image
 from psfcore.image import Image
+from psfcore.instruments.psf_statements import title
 from psfcore.noise import Noise
 from psfcore.psf import Psf
 from psfcore.simulate.plan import CAMERA, DISC, EAST, WEST, Plan
@@ -342,7 +343,7 @@ def demo_image(path: str | Path, psf: Psf, *, size: int = 1024, seed: int = 1) -
     )
     mask = np.zeros(pixels.shape, dtype=np.uint8)
     image = Image(pixels, mask, _demo_header(size, psf), "DN/s", DEMO_EXPOSURE_S)
-    history = [f"simulated scene, seed {seed}, convolved with PSF {psf.name} {psf.version}"]
+    history = [f"simulated scene, seed {seed}, convolved with {title(psf.name, psf.version, None)}"]
     write_image(path, image, cards={}, history=history)
 
 

@@ -19,6 +19,7 @@ from fastapi.responses import JSONResponse
 
 from psfcore.errors import DataError
 from psfcore.fits.frame import plate_scale_arcsec
+from psfcore.instruments.psf_statements import title
 from service.http.callers import Caller, Reading
 from service.http.paging import Listing
 from service.http.problems import Problem
@@ -164,7 +165,7 @@ def product_record(row: ProductRow, image: ImageRow | None, base: str) -> dict[s
 def psf_record(row: PsfRow, base: str) -> dict[str, Any]:
     """The values of a PSF's columns."""
     shape = row.details.get("shape") or (None, None)
-    return _record(row, PSF, f"PSF {row.name} {row.version}", base) | {
+    return _record(row, PSF, title(row.name, row.version, None), base) | {
         "obs_id": row.id,
         "s_xel1": shape[1],
         "s_xel2": shape[0],
