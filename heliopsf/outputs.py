@@ -191,7 +191,7 @@ class Deconvolution(_BeforeAndAfter, Product):
         return cast("Axes", module_of_extra("heliopsf.plots").draw_change(self, axes))
 
     def write(self, path: str | Path, overwrite: bool = False) -> None:
-        """Write the FITS file that ``heliopsf deconvolve`` writes: image, planes, cards and HISTORY.
+        """Write the FITS file that ``heliopsf deconvolve`` writes, with planes and HISTORY.
 
         The file has no id of a product (PRODID) and no hash of its input (INPSHA), which come from a request.
 
