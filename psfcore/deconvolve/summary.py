@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from psfcore.instruments.psf_statements import title
+from psfcore.instruments.psf_statements import offer, title
 
 
 def summary_lines(details: Mapping[str, Any]) -> list[str]:
@@ -13,7 +13,7 @@ def summary_lines(details: Mapping[str, Any]) -> list[str]:
     psf, noise, region = details["psf"], details["noise"], details["region"]
     lines = [
         f"{details['image']}, {title(psf['name'], psf['version'], psf['status'])}",
-        *([f"of this PSF: {'; '.join(psf['assumed'])}"] if psf["assumed"] else []),
+        *([f"caveats of the PSF: {'; '.join(psf['assumed'])}"] if psf["assumed"] else []),
         f"{steps_done(details)}: flux {percent(details['flux_change_pct'], 3)}, brightest 1 % of pixels "
         f"{percent(details['bright_change_pct'])}, darkest 1 % {percent(details['dark_change_pct'])}",
     ]
@@ -23,6 +23,8 @@ def summary_lines(details: Mapping[str, Any]) -> list[str]:
         )
     if noise is not None:
         lines.append(f"errors from the noise: {noise['text']}")
+    if psf.get("published"):  # products of earlier versions have no such entry
+        lines.append(f"better: {offer(psf['published'])}")
     return lines
 
 

@@ -105,7 +105,7 @@ def deconvolve(
         connection() as service,
         progress_bar() as report,
     ):
-        parameters |= {"psf_id": named_psf(service, psf), "overwrite": overwrite}
+        parameters |= {"psf_id": named_psf(service, psf, image=files[0]), "overwrite": overwrite}
         if not into_folder:
             lines = _one(service, files[0], output.path, plot, changes, report, parameters)
             failures: list[Outcome] = []
@@ -219,7 +219,7 @@ def changes(
         psf_file = psf if psf and Path(psf).is_file() else None
         check_outputs((table_file, sheet_file), inputs=(*files, psf_file), overwrite=overwrite)
     with connection() as service, progress_bar() as report:
-        parameters["psf_id"] = named_psf(service, psf)
+        parameters["psf_id"] = named_psf(service, psf, image=Path(files[0]))
         products: dict[str, dict[str, str]] = {}
         treated, failures = treat_many(
             files,

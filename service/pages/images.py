@@ -244,6 +244,8 @@ def product(product_id: Identity, request: Request, caller: PageReading, state: 
     image_lost = None if image is None else _lost(state, image.id, image.bytes)
     deprecated = None if psf is None else deprecation(state.catalogue, psf)
     better = None if deprecated is None else deprecated.redo_with
+    published = row.details["psf"].get("published", [])
+    held = state.catalogue.psfs.page(PsfFilter(name=published[0]), row.owner, limit=1) if published else []
     answer = page(
         request,
         "product.html",
@@ -259,6 +261,8 @@ def product(product_id: Identity, request: Request, caller: PageReading, state: 
             if not deprecated or one["code"] != DEPRECATED_CODE
         ],
         deprecated=deprecated,
+        published=published,
+        redo_published=_again(row, psf_id=held[0].id) if held else None,
         redo=_again(row, psf_id="" if better is None else better.id),
         look_from=LOOK_FROM,
         again=_again(row),
