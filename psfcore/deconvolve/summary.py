@@ -38,18 +38,18 @@ def region_error(error_pct: float | None) -> str:
     )
 
 
-def steps_done(details: Mapping[str, Any]) -> str:
+def steps_done(details: Mapping[str, object]) -> str:
     """The number of steps, and why there were no more, if the request allowed more."""
-    stopped = "" if details["stopped_because"].startswith("all ") else f" ({details['stopped_because']})"
-    steps = details["steps_done"]
+    because, steps = str(details["stopped_because"]), details["steps_done"]
+    stopped = "" if because.startswith("all ") else f" ({because})"
     return f"{steps} step{'' if steps == 1 else 's'}{stopped}"
 
 
-def assumptions(provenance: Mapping[str, Any]) -> list[str]:
+def assumptions(provenance: Mapping[str, object]) -> list[str]:
     """What of a built PSF is not known, from its provenance. Empty for other PSFs."""
     if "mount_basis" not in provenance:
         return []
-    scatter = {None: ["without diffuse scatter"], "inferred": ["scatter inferred"]}
+    scatter: dict[object, list[str]] = {None: ["without diffuse scatter"], "inferred": ["scatter inferred"]}
     mount = ["mount of the filter assumed"] if provenance["mount_basis"] == "assumed" else []
     mesh = ["mesh of the filter assumed"] if "mesh_basis" in provenance else []
     return mount + mesh + scatter.get(provenance.get("scatter_basis"), [])
