@@ -35,8 +35,9 @@ from pathlib import PurePath
 from psfcore.errors import DataError
 from psfcore.fits.cards import Cards, optional_text
 from psfcore.fits.frame import plate_scale_arcsec
-from psfcore.fits.header import FILTER_CARDS, HeaderSummary, Observation, bad_time, utc_time
+from psfcore.fits.header import FILTER_CARDS, HeaderSummary, bad_time, utc_time
 from psfcore.instruments.files import PLATE_SCALE_TOLERANCE
+from psfcore.instruments.observation import Observation
 from psfcore.instruments.unknown import channel_of as channel_of
 from workers.texts import printable
 

@@ -33,6 +33,7 @@ from psfcore.fits.cards import (
 )
 from psfcore.fits.frame import frame_of, plate_scale_arcsec
 from psfcore.instruments.files import match_instrument
+from psfcore.instruments.observation import Observation
 
 if TYPE_CHECKING:
     from astropy.io.fits import Card, Header
@@ -92,22 +93,6 @@ class HduJson(TypedDict):
     bitpix: int
     codec: str | None
     gzipped: bool
-
-
-class Observation(TypedDict):
-    """The values of a header that describe the observation, see `HeaderSummary`."""
-
-    instrument: str | None
-    telescop: str | None
-    instrume: str | None
-    detector: str | None
-    wavelnth: float | None
-    date_obs: str | None
-    exposure_s: float | None
-    unit: str | None
-    cdelt1: float | None
-    cdelt2: float | None
-    gain_mode: str | None
 
 
 class HeaderJson(HduJson, Observation):

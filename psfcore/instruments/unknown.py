@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Literal, TypedDict
 
 from psfcore.errors import DataError
-from psfcore.fits.header import Observation
 from psfcore.instruments.files import PLATE_SCALE_TOLERANCE, WAVELENGTH_TOLERANCE, instrument_names
 from psfcore.instruments.model import load_instrument
+from psfcore.instruments.observation import Observation
 
 WAYS = (
     {
