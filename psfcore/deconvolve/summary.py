@@ -42,10 +42,10 @@ def region_error(error_pct: float | None) -> str:
     )
 
 
-def steps_done(details: Mapping[str, Any]) -> str:
+def steps_done(details: Mapping[str, object]) -> str:
     """The number of steps, and why there were no more, if the request allowed more."""
-    stopped = "" if details["stopped_because"].startswith("all ") else f" ({details['stopped_because']})"
-    steps = details["steps_done"]
+    because, steps = str(details["stopped_because"]), details["steps_done"]
+    stopped = "" if because.startswith("all ") else f" ({because})"
     return f"{steps} step{'' if steps == 1 else 's'}{stopped}"
 
 

@@ -23,6 +23,7 @@ from psfcore.instruments.unknown import channel_of
 from psfcore.psf import Psf
 from psfcore.psf_cache import built_file, kept_psf
 from psfcore.transit.archive import ArchiveContents, unpack
+from workers.contract.documents import header_json
 from workers.contract.identities import instrument_of_build, recipe_of
 from workers.contract.kinds import ResultType
 from workers.contract.requests import Deconvolve, PsfBuild, ResolvedDeconvolve
@@ -78,7 +79,7 @@ class PsfFile(ImageFile):
 
     def seen_as(self, psf: Psf) -> Psf:
         """The PSF with the name, the instrument and the wavelength that an upload would get from the header."""
-        instrument = psf.instrument or instrument_of(asdict(self.summary))
+        instrument = psf.instrument or instrument_of(header_json(asdict(self.summary)))
         channel = channel_of(instrument, self.summary.wavelnth) or ""
         angstrom = psf.wavelength_angstrom
         if angstrom is None and channel.isdecimal():
