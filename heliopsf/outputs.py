@@ -28,8 +28,10 @@ from psfcore.fits.images import CARD_OF_PASS, STATISTICS, passes_of
 from psfcore.image import Image
 
 if TYPE_CHECKING:
+    from astropy.nddata import NDData, StdDevUncertainty
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from sunpy.map import GenericMap
 
 # Cards that are wrong for the result: statistics of the input, and the DOI of an earlier PSF.
 _REMOVED = re.compile(rf"{STATISTICS}|PSFDOI", re.IGNORECASE)
@@ -244,7 +246,7 @@ class Convolution(_BeforeAndAfter, Convolved):
             forward.write(self, file, used_psf(self.psf))
 
 
-def in_form_of(image: Any, result: Deconvolution | Convolution) -> Any:
+def in_form_of(image: object, result: Deconvolution | Convolution) -> object:
     """The result in the form of the user's image: a Map for a Map, an HDU for an HDU, an array for an array."""
     if is_map(image):
         return _as_map(image, result)
@@ -262,7 +264,7 @@ def in_form_of(image: Any, result: Deconvolution | Convolution) -> Any:
         return result
     if is_pair(image):
         return in_form_of(image[0], result), _described(image[1], result)
-    pixels: Any = result.pixels
+    pixels = result.pixels
     if isinstance(image, np.ma.MaskedArray):
         return np.ma.MaskedArray(pixels, result.mask)
     if isinstance(image, units.Quantity):
@@ -291,7 +293,7 @@ def _cards_and_history(result: Deconvolution | Convolution) -> tuple[Cards, list
     return deconvolution_cards(result, used) | own, deconvolution_history(result, used)
 
 
-def _as_map(image: Any, result: Deconvolution | Convolution) -> Any:
+def _as_map(image: GenericMap, result: Deconvolution | Convolution) -> GenericMap:
     meta = _described(image.meta, result)
     smap = type(image)(result.pixels, meta, mask=_mask(image, result), uncertainty=_uncertainty(result))
     # The settings are set last, because the class of a Map may choose other settings for a new Map.
@@ -299,7 +301,7 @@ def _as_map(image: Any, result: Deconvolution | Convolution) -> Any:
     return smap
 
 
-def _as_nddata(image: Any, result: Deconvolution | Convolution) -> Any:
+def _as_nddata(image: NDData, result: Deconvolution | Convolution) -> NDData:
     return type(image)(
         result.pixels,
         mask=_mask(image, result),
@@ -310,11 +312,11 @@ def _as_nddata(image: Any, result: Deconvolution | Convolution) -> Any:
     )
 
 
-def _mask(image: Any, result: Deconvolution | Convolution) -> NDArray[np.bool_] | None:
+def _mask(image: NDData, result: Deconvolution | Convolution) -> NDArray[np.bool_] | None:
     return result.mask if image.mask is not None or result.mask.any() else None
 
 
-def _uncertainty(result: Deconvolution | Convolution) -> Any:
+def _uncertainty(result: Deconvolution | Convolution) -> StdDevUncertainty | None:
     if result.error is None:
         return None
     from astropy.nddata import StdDevUncertainty
