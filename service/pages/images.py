@@ -10,7 +10,6 @@ import shutil
 import tempfile
 from importlib.resources import as_file, files
 from pathlib import Path
-from typing import Any
 
 from fastapi import APIRouter, Request, Response
 from fastapi.concurrency import run_in_threadpool
@@ -188,7 +187,7 @@ def _psfs(chosen: str, image: ImageRow, caller: Caller, state: State) -> tuple[l
     return fit, [psf for psf in found if psf not in fit]
 
 
-def _checked(image_id: str, asked: Sent, caller: Caller, state: State) -> dict[str, Any]:
+def _checked(image_id: str, asked: Sent, caller: Caller, state: State) -> dict[str, object]:
     """The check of the options. good: whether the job can start. lines: sentences, the most important first. button:
     its text. code: of the problem; empty if there is none.
     """
