@@ -44,7 +44,6 @@ from psfcore.image import Image
 if TYPE_CHECKING:
     from astropy.nddata import NDData
     from astropy.wcs.wcsapi import BaseHighLevelWCS, SlicedLowLevelWCS
-    from sunpy.map import GenericMap
 
 ImageHdu: TypeAlias = "fits.PrimaryHDU | fits.ImageHDU | fits.CompImageHDU"
 _EXPECTED = (
@@ -71,7 +70,7 @@ class _Parts:
     planes: Mapping[str, ArrayLike | None]
 
 
-def is_map(image: object) -> TypeGuard[GenericMap]:
+def is_map(image: object) -> TypeGuard[NDData]:
     """Whether an object is a sunpy Map."""
     return _is_of(image, "sunpy.map", "GenericMap")
 

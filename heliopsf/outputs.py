@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from astropy.nddata import NDData, StdDevUncertainty
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from sunpy.map import GenericMap
 
 # Cards that are wrong for the result: statistics of the input, and the DOI of an earlier PSF.
 _REMOVED = re.compile(rf"{STATISTICS}|PSFDOI", re.IGNORECASE)
@@ -293,7 +292,7 @@ def _cards_and_history(result: Deconvolution | Convolution) -> tuple[Cards, list
     return deconvolution_cards(result, used) | own, deconvolution_history(result, used)
 
 
-def _as_map(image: GenericMap, result: Deconvolution | Convolution) -> GenericMap:
+def _as_map(image: NDData, result: Deconvolution | Convolution) -> NDData:
     meta = _described(image.meta, result)
     smap = type(image)(result.pixels, meta, mask=_mask(image, result), uncertainty=_uncertainty(result))
     # The settings are set last, because the class of a Map may choose other settings for a new Map.
