@@ -157,7 +157,7 @@ def deconvolve(
         threads=work.threads,
     )
 
-    def one(image: Any) -> Any:
+    def one(image: object) -> object:
         box = None if given.region is None else box_of(given.region, image, given.hdu)
         sigma = None if work.noise is not None else uncertainty_of(image)
         if sigma is not None and not work.error_draws:
@@ -197,7 +197,7 @@ def deconvolve(
 
 
 def convolve(
-    smap: Any,
+    smap: object,
     psf: AnyPsf | None = None,
     *,
     edges: KnownScene = "zero",
@@ -269,7 +269,7 @@ def convolve(
         return result if full else in_form_of(there, result)
 
 
-def psf_for(image: Any, *, threads: int | None = None, progress: Progress = None) -> Psf:
+def psf_for(image: object, *, threads: int | None = None, progress: Progress = None) -> Psf:
     """Find the PSF for an image, on the pixels of the image.
 
     A service without certified PSFs chooses the same PSF. The first call for a telescope takes up to a minute; the PSF

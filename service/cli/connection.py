@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import TYPE_CHECKING, TypeVar, cast
 
 import click
 from click.shell_completion import CompletionItem
@@ -76,22 +76,18 @@ def server_option(what: str, *, or_local: bool = False) -> Callable[[Command], C
 
     The command does not get their values: `connection`, `remote` and `is_local` find them in the context.
     """
-    key = click.option(
+    key = kept(_KEY)(
         "--key",
         envvar="HELIOPSF_KEY",
-        **kept(_KEY),
         help="Access key. Other users can read command lines, so set HELIOPSF_KEY instead",
     )
-    server = click.option(
+    server = kept(CHOSEN_SERVER)(
         "--server",
         metavar="ADDRESS",
         envvar="HELIOPSF_SERVER",
-        **kept(CHOSEN_SERVER),
         help=f"{what} [default: {DEFAULT_SERVER}]{'; --local needs none' if or_local else ''}",
     )
-    local = click.option(
-        "--local", is_flag=True, **kept(LOCAL), help="Run in this process, without a service"
-    )
+    local = kept(LOCAL)("--local", is_flag=True, help="Run in this process, without a service")
     return lambda command: server(key(local(command) if or_local else command))
 
 
@@ -145,7 +141,7 @@ def on_service(command: Command) -> Command:
 
     @SERVER
     @wraps(command)
-    def connected(**given: Any) -> Any:
+    def connected(**given: object) -> object:
         with remote() as service:
             return command(service=service, **given)
 

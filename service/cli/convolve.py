@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 import click
 
@@ -35,7 +35,7 @@ def convolve(
     edges: KnownScene,
     plot: Path | None,
     overwrite: bool,
-    **parameters: Any,
+    **parameters: object,
 ) -> None:
     """Convolve IMAGE (FITS), a model of the Sun, with a PSF: what the telescope would record.
 

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from psfcore.deconvolve.conditions import PreparedPsfs
 from psfcore.deconvolve.run import BUILDING, PsfSource, UsedPsf
@@ -36,6 +36,7 @@ from workers.tasks.workspace import Progress, Result, Workspace
 from workers.versions import PsfStatus, instrument_of
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
 
     from psfcore.recipe import Recipe
@@ -210,7 +211,7 @@ class LocalWorkspace(Workspace):
         return self._kept(recipe_of(build), partial(self.report, BUILDING))
 
     def build(
-        self, recipe: Recipe, mount_image: NDArray[Any] | None, progress: Callable[[int, int], None]
+        self, recipe: Recipe, mount_image: NDArray[np.floating] | None, progress: Callable[[int, int], None]
     ) -> tuple[Psf, Callable[[Path], object]]:
         copy = self.settings.data_dir / f"{recipe.identity}.fits"
         with built_file(
@@ -219,8 +220,10 @@ class LocalWorkspace(Workspace):
             shutil.copyfile(file, copy)
         return read_psf(copy, LIMITS), partial(shutil.copyfile, copy)
 
-    def _kept(self, recipe: Recipe, progress: Callable[[int, int], None] | None = None, **how: Any) -> Psf:
-        return kept_psf(psf_cache(), recipe, LIMITS, threads=self.threads, progress=progress, **how)
+    def _kept(
+        self, recipe: Recipe, progress: Callable[[int, int], None] | None = None, *, parts: bool = True
+    ) -> Psf:
+        return kept_psf(psf_cache(), recipe, LIMITS, threads=self.threads, progress=progress, parts=parts)
 
     @contextmanager
     def unpacked(self, transit_id: str) -> Iterator[Path]:

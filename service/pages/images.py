@@ -8,9 +8,10 @@ from __future__ import annotations
 import hashlib
 import shutil
 import tempfile
+from collections.abc import Mapping, Sequence
 from importlib.resources import as_file, files
 from pathlib import Path
-from typing import Any
+from typing import cast
 
 from fastapi import APIRouter, Request, Response
 from fastapi.concurrency import run_in_threadpool
@@ -189,7 +190,7 @@ def _psfs(chosen: str, image: ImageRow, caller: Caller, state: State) -> tuple[l
     return fit, [psf for psf in found if psf not in fit]
 
 
-def _checked(image_id: str, asked: Sent, caller: Caller, state: State) -> dict[str, Any]:
+def _checked(image_id: str, asked: Sent, caller: Caller, state: State) -> dict[str, object]:
     """The check of the options. good: whether the job can start. lines: sentences, the most important first. button:
     its text. code: of the problem; empty if there is none.
     """
@@ -199,7 +200,11 @@ def _checked(image_id: str, asked: Sent, caller: Caller, state: State) -> dict[s
         if problem.status not in OF_OPTIONS:
             raise
         advice = (SURE,) if problem.code in TO_ALLOW else ()
-        ways = [plain(one["known"]) for one in problem.more.get("ways", ()) if "known" in one]
+        ways = [
+            plain(one["known"])
+            for one in cast("Sequence[Mapping[str, str]]", problem.more.get("ways", ()))
+            if "known" in one
+        ]
         lines = [of_problem(problem), *ways, *advice]
         return {"good": False, "lines": lines, "button": CHECK, "code": problem.code}
     button = OPEN if found.existing else START

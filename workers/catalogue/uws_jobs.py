@@ -56,8 +56,8 @@ class UwsJobs:
             session.add_all((row, TermsRow(job_id=job_id, **terms)))
         return row
 
-    def amend(self, job_id: str, change: Callable[[dict[str, object]], dict[str, object]]) -> bool:
-        """Change the parameters of a PENDING job. In any other phase, nothing changes; returns False."""
+    def amend(self, job_id: str, change: Callable[[dict[str, str]], dict[str, str]]) -> bool:
+        """Change the parameters of a PENDING job (texts). In any other phase, nothing changes; returns False."""
         with self._database.writing.begin() as session:
             row = _locked(session, job_id)
             if row is None or row.phase != Phase.PENDING:
