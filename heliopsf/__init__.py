@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from heliopsf.images import convolve as convolve
@@ -70,7 +70,7 @@ def _check_packages() -> None:
             )
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     if name == "__version__":
         from psfcore import software_version
 

@@ -43,6 +43,7 @@ from psfcore.fits.header import seen_by
 from psfcore.image import Image
 from psfcore.instruments.unknown import unknown_instrument
 from psfcore.psf_sampling import psf_for_image
+from psfcore.published_psfs import PUBLISHED_OF_IMAGE, published_of
 from psfcore.scatter.total_psf import possible_on_pixels
 from workers.machine import cores, free_bytes
 
@@ -87,9 +88,9 @@ def deconvolve(
         ``Deconvolution``, for a MapSequence a MapSequence. Pixels that are NaN or masked are not used; they are NaN in
         the result.
     psf : Psf, path, name, array, optional
-        A PSF, its FITS file, the name of a known instrument, an instrument file (TOML), or weights with their centre at
-        [ny // 2, nx // 2]. Default: the PSF of the telescope in the header (``psf_for``), without its components. The
-        PSF is rebinned if the image is binned.
+        A PSF, its FITS file, the name of a known instrument, an instrument file (TOML), the name of a published PSF
+        ("published": that of the image), or weights with their centre at [ny // 2, nx // 2]. Default: the PSF of the
+        telescope in the header (``psf_for``), without its components. The PSF is rebinned if the image is binned.
     iterations : int, optional
         Number of steps, also called ``steps``. Default: that of the method (Richardson-Lucy: 20; aiapy: 25).
     clip_negative : bool, optional
@@ -156,7 +157,7 @@ def deconvolve(
         threads=work.threads,
     )
 
-    def one(image: Any) -> Any:
+    def one(image: object) -> object:
         box = None if given.region is None else box_of(given.region, image, given.hdu)
         sigma = None if work.noise is not None else uncertainty_of(image)
         if sigma is not None and not work.error_draws:
@@ -196,7 +197,7 @@ def deconvolve(
 
 
 def convolve(
-    smap: Any,
+    smap: object,
     psf: AnyPsf | None = None,
     *,
     edges: KnownScene = "zero",
@@ -268,7 +269,7 @@ def convolve(
         return result if full else in_form_of(there, result)
 
 
-def psf_for(image: Any, *, threads: int | None = None, progress: Progress = None) -> Psf:
+def psf_for(image: object, *, threads: int | None = None, progress: Progress = None) -> Psf:
     """Find the PSF for an image, on the pixels of the image.
 
     A service without certified PSFs chooses the same PSF. The first call for a telescope takes up to a minute; the PSF
@@ -325,6 +326,8 @@ def _source_of(
     )
     if psf is None:
         return source(partial(_built_for, threads=threads, parts=False))
+    if isinstance(psf, str) and psf == PUBLISHED_OF_IMAGE and not Path(psf).exists():
+        return source(lambda header, _: given_psf(published_of(header).name, threads=threads, progress=None))
     instrument = instrument_named(psf)
     if instrument is None:
         own = given_psf(psf, threads=threads, progress=None)

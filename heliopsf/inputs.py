@@ -14,15 +14,15 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard
 
 import numpy as np
 from astropy import units
 from astropy.io import fits
 from astropy.io.fits import Header
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from heliopsf.parameters import COUNTS, level_dn
+from heliopsf.parameters import COUNTS, Region, level_dn
 from heliopsf.psfs import existing_file
 from psfcore.deconvolve.box import Box
 from psfcore.errors import DataError, DataWarning
@@ -41,6 +41,11 @@ from psfcore.fits.unusable import ERRORS, FLAGS
 from psfcore.fits.viewing.regions import moved_header
 from psfcore.image import Image
 
+if TYPE_CHECKING:
+    from astropy.nddata import NDData
+    from astropy.wcs.wcsapi import BaseHighLevelWCS, SlicedLowLevelWCS
+
+ImageHdu: TypeAlias = "fits.PrimaryHDU | fits.ImageHDU | fits.CompImageHDU"
 _EXPECTED = (
     "a sunpy Map, an NDData, CCDData or NDCube, an array, a pair (array, header), an HDU or HDUList, a path or the "
     "bytes of a FITS file, or a list of these"
@@ -62,25 +67,25 @@ class _Parts:
 
     data: Any
     header: Header
-    planes: Mapping[str, Any]
+    planes: Mapping[str, ArrayLike | None]
 
 
-def is_map(image: object) -> bool:
+def is_map(image: object) -> TypeGuard[NDData]:
     """Whether an object is a sunpy Map."""
     return _is_of(image, "sunpy.map", "GenericMap")
 
 
-def is_nddata(image: object) -> bool:
+def is_nddata(image: object) -> TypeGuard[NDData]:
     """Whether an object is an NDData, such as a CCDData. A sunpy Map is also an NDData."""
     return _is_of(image, "astropy.nddata", "NDData")
 
 
-def is_hdu(image: object) -> bool:
+def is_hdu(image: object) -> TypeGuard[ImageHdu]:
     """Whether an object is an HDU of images."""
     return isinstance(image, _HDUS)
 
 
-def is_pair(image: object) -> bool:
+def is_pair(image: object) -> TypeGuard[tuple[NDArray[np.generic], Mapping[str, object] | Header]]:
     """Whether an object is an array with its metadata: (array, header or table of cards)."""
     return isinstance(image, tuple) and len(image) == 2 and isinstance(image[1], Mapping | Header)
 
@@ -140,7 +145,7 @@ def image_of(image: object, *, saturation: object, hdu: int | None = None) -> Im
     )
 
 
-def _as_large(plane: Any, shape: tuple[int, ...]) -> NDArray[np.generic]:
+def _as_large(plane: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.generic]:
     """A mask or an uncertainty for every pixel. Raises ``DataError`` "mask-shape"."""
     try:
         return np.broadcast_to(plane, shape)
@@ -149,18 +154,17 @@ def _as_large(plane: Any, shape: tuple[int, ...]) -> NDArray[np.generic]:
         raise DataError("mask-shape", message) from error
 
 
-def uncertainty_of(image: Any) -> NDArray[np.float64] | None:
+def uncertainty_of(image: object) -> NDArray[np.float64] | None:
     """The standard deviation [y, x] of an NDData in the unit of its pixels; None if it has none.
 
     Gives a ``DataWarning`` "uncertainty-dropped" for an uncertainty of an unknown kind.
     """
-    uncertainty = getattr(image, "uncertainty", None) if is_nddata(image) else None
-    if uncertainty is None:
+    if not is_nddata(image) or image.uncertainty is None:
         return None
     from astropy.nddata import StdDevUncertainty
 
     try:
-        deviation = uncertainty.represent_as(StdDevUncertainty)
+        deviation = image.uncertainty.represent_as(StdDevUncertainty)
         unit = image.unit or units.dimensionless_unscaled
         return np.asarray(
             units.Quantity(deviation.array, deviation.unit or unit).to_value(unit), dtype=np.float64
@@ -208,13 +212,13 @@ def header_of(image: object, hdu: int | None = None) -> Header:
     return _header(image) if isinstance(image, Mapping) else _parts_of(image).header
 
 
-def hdu_of(image: object, number: int | None = None) -> Any:
+def hdu_of(image: object, number: int | None = None) -> ImageHdu:
     """An HDU, or that of an HDUList as `_chosen` chooses it."""
     chosen, hdus = _chosen(image, number)
     return hdus[chosen]
 
 
-def _chosen(image: Any, number: int | None) -> tuple[int, dict[int, Any]]:
+def _chosen(image: object, number: int | None) -> tuple[int, dict[int, ImageHdu]]:
     """The number of the HDU, or of the first one with an image of two axes; and all such HDUs by their numbers.
 
     Raises ``DataError`` "three-axes" if an image of more axes comes first, "no-image" and "not-2d".
@@ -238,7 +242,7 @@ def _chosen(image: Any, number: int | None) -> tuple[int, dict[int, Any]]:
     )
 
 
-def _parts_of(image: Any) -> _Parts:
+def _parts_of(image: object) -> _Parts:
     """An image in memory with its header. Raises ``DataError`` "bad-input" and "bad-unit"."""
     image, meta = image if is_pair(image) else (image, {})
     header = _header(image.meta if is_nddata(image) else meta)
@@ -280,7 +284,7 @@ def _computed(data: Any) -> NDArray[np.generic]:
     return np.asarray(data.compute())
 
 
-def unit_text(unit: Any) -> str | None:
+def unit_text(unit: units.UnitBase | units.function.FunctionUnitBase | None) -> str | None:
     """The value of the card BUNIT for a unit; adu and counts also become "DN". Raises ``DataError`` "bad-unit"."""
     if unit is None:
         return None
@@ -298,7 +302,7 @@ def unit_text(unit: Any) -> str | None:
     return str(unit) or None
 
 
-def _header(meta: Mapping[str, Any]) -> Header:
+def _header(meta: Mapping[str, object] | Header) -> Header:
     """The cards of a table. Values that no card can hold are left out: such values do not describe the observation."""
     if isinstance(meta, Header):
         return meta.copy()
@@ -316,7 +320,7 @@ def _header(meta: Mapping[str, Any]) -> Header:
     return header
 
 
-def box_of(region: Any, image: Any, hdu: int | None = None) -> Box:
+def box_of(region: Region, image: object, hdu: int | None = None) -> Box:
     """The pixels of a region of an image.
 
     region: a text "x0:x1,y0:y1"; two slices [y, x], such as ``np.s_[50:250, 100:400]``; or, for a Map, its bottom left
@@ -327,11 +331,12 @@ def box_of(region: Any, image: Any, hdu: int | None = None) -> Box:
     if isinstance(region, str):
         return Box.parse(region).checked(shape)
     two = isinstance(region, tuple | list) and len(region) == 2
-    if two and all(isinstance(part, slice) for part in region):
-        steps = [part.step for part in region if part.step not in (None, 1)]
+    slices = [part for part in region if isinstance(part, slice)] if two else []
+    if len(slices) == 2:
+        steps = [part.step for part in slices if part.step not in (None, 1)]
         if steps:
             raise DataError("bad-region", f"expected slices without a step; got a step of {steps[0]}")
-        (y0, y1, _), (x0, x1, _) = (part.indices(size) for part, size in zip(region, shape, strict=True))
+        (y0, y1, _), (x0, x1, _) = (part.indices(size) for part, size in zip(slices, shape, strict=True))
         return Box(x0, x1, y0, y1).checked(shape)
     if not two or not is_map(image):
         raise DataError(
@@ -354,7 +359,7 @@ def box_of(region: Any, image: Any, hdu: int | None = None) -> Box:
     return Box(x0, x0 + nx, y0, y0 + ny).checked(shape)
 
 
-def cut(image: Any, box: Box, hdu: int | None = None) -> Any:
+def cut(image: object, box: Box, hdu: int | None = None) -> object:
     """The box of a Map, an NDData or an HDU, with its coordinates; other images unchanged."""
     if is_map(image):
         top_right = [box.x1 - 1, box.y1 - 1] * units.pix
@@ -377,7 +382,7 @@ def cut(image: Any, box: Box, hdu: int | None = None) -> Any:
     return image
 
 
-def _part_of(wcs: Any, box: Box) -> Any:
+def _part_of(wcs: BaseHighLevelWCS | None, box: Box) -> BaseHighLevelWCS | SlicedLowLevelWCS | None:
     """The coordinates of a box. Those of a slice of a cube are no ``WCS``, and have no slices of their own."""
     if wcs is None or hasattr(wcs, "to_header"):
         return None if wcs is None else wcs[box.slices]
@@ -386,7 +391,7 @@ def _part_of(wcs: Any, box: Box) -> Any:
     return SlicedLowLevelWCS(wcs.low_level_wcs, box.slices)
 
 
-def _moved(meta: Mapping[str, Any] | Header, columns: slice, rows: slice) -> Any:
+def _moved(meta: Mapping[str, object] | Header, columns: slice, rows: slice) -> dict[str, object] | Header:
     """A header or a table of cards for these columns and rows."""
     if isinstance(meta, Header):
         return moved_header(meta, columns, rows)

@@ -36,6 +36,7 @@ from psfcore.fits.images import CARD_OF_PASS, STATISTICS, passes_of
 from psfcore.image import Image
 
 if TYPE_CHECKING:
+    from astropy.nddata import NDData, StdDevUncertainty
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -283,7 +284,7 @@ class Convolution(_BeforeAndAfter, Convolved):
             forward.write(self, file, used_psf(self.psf))
 
 
-def in_form_of(image: Any, result: Deconvolution | Convolution) -> Any:
+def in_form_of(image: object, result: Deconvolution | Convolution) -> object:
     """The result in the form of the user's image: a Map for a Map, an HDU for an HDU, an array for an array."""
     if is_map(image):
         return _as_map(image, result)
@@ -301,7 +302,7 @@ def in_form_of(image: Any, result: Deconvolution | Convolution) -> Any:
         return result
     if is_pair(image):
         return in_form_of(image[0], result), _described(image[1], result)
-    pixels: Any = result.pixels
+    pixels = result.pixels
     if isinstance(image, np.ma.MaskedArray):
         return np.ma.MaskedArray(pixels, result.mask)
     if isinstance(image, units.Quantity):
@@ -330,7 +331,7 @@ def _cards_and_history(result: Deconvolution | Convolution) -> tuple[Cards, list
     return deconvolution_cards(result, used) | own, deconvolution_history(result, used)
 
 
-def _as_map(image: Any, result: Deconvolution | Convolution) -> Any:
+def _as_map(image: NDData, result: Deconvolution | Convolution) -> NDData:
     meta = _described(image.meta, result)
     smap = type(image)(result.pixels, meta, mask=_mask(image, result), uncertainty=_uncertainty(result))
     # The settings are set last, because the class of a Map may choose other settings for a new Map.
@@ -338,7 +339,7 @@ def _as_map(image: Any, result: Deconvolution | Convolution) -> Any:
     return smap
 
 
-def _as_nddata(image: Any, result: Deconvolution | Convolution) -> Any:
+def _as_nddata(image: NDData, result: Deconvolution | Convolution) -> NDData:
     return type(image)(
         result.pixels,
         mask=_mask(image, result),
@@ -349,11 +350,11 @@ def _as_nddata(image: Any, result: Deconvolution | Convolution) -> Any:
     )
 
 
-def _mask(image: Any, result: Deconvolution | Convolution) -> NDArray[np.bool_] | None:
+def _mask(image: NDData, result: Deconvolution | Convolution) -> NDArray[np.bool_] | None:
     return result.mask if image.mask is not None or result.mask.any() else None
 
 
-def _uncertainty(result: Deconvolution | Convolution) -> Any:
+def _uncertainty(result: Deconvolution | Convolution) -> StdDevUncertainty | None:
     if result.error is None:
         return None
     from astropy.nddata import StdDevUncertainty

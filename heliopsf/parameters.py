@@ -5,9 +5,9 @@ progress.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 from astropy import units
@@ -20,10 +20,13 @@ from psfcore.fits.header import optional_exposure_s
 from psfcore.noise import Noise
 
 if TYPE_CHECKING:
+    from astropy.coordinates import SkyCoord
     from numpy.typing import ArrayLike, NDArray
 
 Number: TypeAlias = "float | units.Quantity"
 NoiseFigures: TypeAlias = "tuple[Number, Number] | Noise"
+# A text, two slices [y, x], or two corners.
+Region: TypeAlias = "str | tuple[slice, slice] | Sequence[SkyCoord | units.Quantity]"
 Steps = Callable[[int, int], None]
 # True: show a line on standard error; a function: call it with (step, steps); None, False: show nothing.
 Progress = Steps | bool | None
@@ -78,7 +81,7 @@ class Options:
     noise: NoiseFigures | None = None
     other_channel: bool = False
     again: bool = False
-    region: Any = None
+    region: Region | None = None
     region_error: Number = LARGEST_ERROR
     error_draws: int = 0
     edges: Edges | None = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib import pyplot
@@ -50,7 +50,7 @@ def draw_psf(psf: Psf, axes: Axes | None, *, size: int) -> Axes:
         ylabel="y from centre (px)",
         title=title(psf.name, psf.version, psf.status),
     )
-    _figure(axes).colorbar(drawn, ax=axes, label="Weight (fraction per pixel)")
+    axes.figure.colorbar(drawn, ax=axes, label="Weight (fraction per pixel)")
     return axes
 
 
@@ -115,12 +115,8 @@ def draw_fit(fit: TransitFit, axes: Axes | None) -> Axes:
 def _draw(axes: Axes, plane: NDArray[np.floating], colours: Colormap, norm: Normalize, label: str) -> None:
     drawn = axes.imshow(plane, origin="lower", cmap=colours, norm=norm, interpolation="nearest")
     axes.set(xlabel="x (px)", ylabel="y (px)")
-    _figure(axes).colorbar(drawn, ax=axes, label=label)
+    axes.figure.colorbar(drawn, ax=axes, label=label)
 
 
 def _axes(axes: Axes | None) -> Axes:
     return pyplot.subplots()[1] if axes is None else axes
-
-
-def _figure(axes: Axes) -> Any:
-    return axes.get_figure()

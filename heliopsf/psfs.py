@@ -311,7 +311,7 @@ def build_psf(
     )
 
 
-def given_psf(psf: Any, *, threads: int, progress: Steps | None) -> Psf:
+def given_psf(psf: object, *, threads: int, progress: Steps | None) -> Psf:
     """The PSF that a user gives: a PSF, a file, the name or the file of an instrument, the name of a published PSF, or
     weights.
 
@@ -336,7 +336,7 @@ def given_psf(psf: Any, *, threads: int, progress: Steps | None) -> Psf:
     return Psf(kernel=kernel, name="array", version="unversioned", instrument=None, status="user")
 
 
-def instrument_named(psf: Any) -> Instrument | None:
+def instrument_named(psf: object) -> Instrument | None:
     """The instrument whose name or file (TOML) a user gives as the PSF; None for other PSFs.
 
     Raises ``DataError`` of ``psfcore.instruments.model.load_instrument``.

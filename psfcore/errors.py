@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from importlib import import_module
-from typing import Any
+from types import ModuleType
 
 # If a module of heliopsf itself is missing, the installation is faulty.
 _OWN = ("heliopsf", "psfcore", "workers", "service")
@@ -72,7 +72,7 @@ class MissingExtra(ImportError):
     """
 
 
-def module_of_extra(module: str) -> Any:
+def module_of_extra(module: str) -> ModuleType:
     """Import a module that may need the packages of an extra, such as "plot".
 
     Raises MissingExtra, whose message names the missing package and the extra.

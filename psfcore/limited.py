@@ -77,7 +77,7 @@ def run_limited(
     pixels: int,
     seconds: int = SECONDS,
     answer_bytes: int | None = None,
-    **arguments: Any,
+    **arguments: object,
 ) -> Answer:
     """Call ``function(target, path=path, **arguments)`` in a child process; returns its answer.
 

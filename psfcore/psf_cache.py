@@ -80,10 +80,10 @@ class PsfCache:
             path.unlink()
         return None
 
-    def provenance(self, identity: str) -> dict[str, Any]:
+    def provenance(self, identity: str) -> dict[str, object]:
         """How a PSF of the cache was made; empty if this was not kept."""
         try:
-            found: dict[str, Any] = json.loads((self.folder / f"{identity}.{PROVENANCE}").read_bytes())
+            found: dict[str, object] = json.loads((self.folder / f"{identity}.{PROVENANCE}").read_bytes())
         except (FileNotFoundError, ValueError):
             return {}
         return found
@@ -186,7 +186,7 @@ def built_file(
     mount_image: NDArray[np.floating] | None = None,
     threads: int,
     progress: Callable[[int, int], None] | None = None,
-) -> Iterator[tuple[Path, dict[str, Any]]]:
+) -> Iterator[tuple[Path, dict[str, object]]]:
     """The file of the PSF of a recipe and its provenance: from the cache, or built and kept there.
 
     parts: False: the PSF without its components, which is built in less time. If the components are asked for later,

@@ -28,8 +28,10 @@ from psfcore.instruments.published import PUBLISHED, Published
 if TYPE_CHECKING:
     from requests import Response
 
+    from psfcore.fits.cards import Cards
     from psfcore.psf import Psf
 
+PUBLISHED_OF_IMAGE = "published"  # names the published PSF of an image
 MIB = 2**20
 TRIES_AGAIN = 4
 _TIMEOUT_S = 60  # without a byte
@@ -49,6 +51,27 @@ def published(name: str) -> Published:
             "`heliopsf psf published` lists them",
         )
     return PUBLISHED[name]
+
+
+def published_of(header: Cards) -> Published:
+    """The published PSF for an image with this header. Raises DataError "no-published-psf" if none or several fit."""
+    from psfcore.fits.channel import PsfOrigin, channel_differences  # `psf published` reads no header
+
+    def fits(one: Published) -> bool:
+        scale, wavelength = one.plate_scale_arcsec, one.wavelength_angstrom
+        return not channel_differences(
+            PsfOrigin(one.name, one.instrument, wavelength, scale, one.cards), header
+        )
+
+    fitting = [one for one in PUBLISHED.values() if fits(one)]
+    if len(fitting) != 1:
+        names = ", ".join(one.name for one in fitting)
+        raise DataError(
+            "no-published-psf",
+            f"expected an image for which one PSF is published; got an image for which {names or 'none'} could be "
+            "used: name the PSF, `heliopsf psf published` lists them",
+        )
+    return fitting[0]
 
 
 def kept_file(folder: Path, name: str) -> Path:

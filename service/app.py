@@ -160,7 +160,7 @@ def _correct_description(app: FastAPI) -> None:
     """
     generate = app.openapi
 
-    def openapi() -> dict[str, Any]:
+    def openapi() -> dict[str, object]:
         if app.openapi_schema is None:
             _correct(generate())
         assert app.openapi_schema is not None

@@ -12,7 +12,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, cast
+from typing import TypeVar
 
 from fastapi import APIRouter, Request, Response
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Metric, generate_latest
@@ -31,6 +31,7 @@ from workers.contract.kinds import KINDS
 from workers.settings import software_version
 
 STOPPED = "the reconciler has not succeeded for 30 s, so jobs are not submitted; read the log of the server"
+Labels = TypeVar("Labels", bound=str | tuple[str, ...])  # the value of the label, or those of all labels
 router = APIRouter(tags=["operation"])
 NOT_READY = {
     "model": ProblemDocument,
@@ -197,15 +198,15 @@ class _Catalogued(Collector):
         yield _gauge("file_bytes", "Bytes of stored files", sizes, "kind", "origin")
 
 
-def _gauge(name: str, description: str, values: float | Mapping[Any, float], *labels: str) -> Metric:
+def _gauge(name: str, description: str, values: float | Mapping[Labels, float], *labels: str) -> Metric:
     """A gauge. values: its value, or the values by the value of the label, or by a tuple of the values of the
     labels.
     """
-    by_label = values if isinstance(values, Mapping) else {(): values}
-    return _filled(GaugeMetricFamily(f"heliopsf_{name}", description, labels=labels), by_label)
+    gauge = GaugeMetricFamily(f"heliopsf_{name}", description, labels=labels)
+    return _filled(gauge, values if isinstance(values, Mapping) else {(): values})
 
 
-def _filled(family: Any, values: Mapping[Any, float]) -> Metric:
+def _filled(family: CounterMetricFamily | GaugeMetricFamily, values: Mapping[Labels, float]) -> Metric:
     for key, value in values.items():
         family.add_metric([key] if isinstance(key, str) else key, value)
-    return cast("Metric", family)
+    return family

@@ -20,7 +20,7 @@ class RowView(BaseModel):
     """The description of a row of the catalogue, for its owner."""
 
     @classmethod
-    def of_columns(cls, row: object, **computed: Any) -> Self:
+    def of_columns(cls, row: object, **computed: object) -> Self:
         """The description whose fields are the columns of the row with the same names, and ``computed``."""
         columns = {name: getattr(row, name) for name in cls.model_fields if hasattr(row, name)}
         return cls.model_validate(columns | computed)
@@ -155,7 +155,7 @@ class ProductView(RowView):
     psf_version: str
     bytes: int
     sha256: str = Field(description="SHA-256 of the file")
-    details: dict[str, Any] = Field(
+    details: dict[str, object] = Field(
         description="method, parameters, versions, and what the deconvolution changed in the image (`changes`)"
     )
     file: str = Field(description="address of the FITS file")
@@ -169,7 +169,7 @@ class ProductView(RowView):
     )
 
     @classmethod
-    def of(cls, row: ProductRow, details: dict[str, Any] | None = None) -> ProductView:
+    def of(cls, row: ProductRow, details: dict[str, object] | None = None) -> ProductView:
         """The description of a product, from its row in the catalogue.
 
         details: the current details of the product; default: the details in the row.
@@ -252,7 +252,7 @@ class ReportView(RowView):
         description="id of the PSF or product; null: the report is not on a PSF or product"
     )
     bytes: int
-    details: dict[str, Any] = Field(description="the summary sentence and the main figures")
+    details: dict[str, object] = Field(description="the summary sentence and the main figures")
     file: str = Field(description="address of the whole report as JSON")
     preview: str | None = Field(description="address of the picture; null: the report has none")
     html: str | None = Field(

@@ -35,7 +35,10 @@ from workers.contract.requests import ResolvedRerun
 from workers.versions import INTERPOLATED
 
 if TYPE_CHECKING:
+    from prov.identifier import QualifiedName
     from prov.model import ProvDocument
+
+    Attribute = QualifiedName | datetime | str | bool | None
 
 MOST_DEEP = 16
 MOST_THINGS = 200
@@ -59,7 +62,7 @@ class Creation(BaseModel):
     algorithm_version: int | None = None
     software_version: str | None = None
     libraries: dict[str, str] | None = None
-    parameters: dict[str, Any] | None = None
+    parameters: dict[str, object] | None = None
 
 
 class Ancestor(BaseModel):
@@ -122,7 +125,7 @@ def made_by(catalogue: Catalogue, row: ProductRow | PsfRow) -> ResolvedRerun:
         ) from error
 
 
-def _job_of(row: ProductRow | PsfRow, parameters: dict[str, Any]) -> ResolvedRerun:
+def _job_of(row: ProductRow | PsfRow, parameters: dict[str, object]) -> ResolvedRerun:
     """The job with these parameters. The catalogue may contain only the parameters that the client gave; this function
     adds the defaults.
     """
@@ -284,8 +287,8 @@ class _Document:
             above = self.add(parent)
             if not self._new(f"{name} from {above}"):
                 continue
-            weight: dict[Any, Any] = {} if parent.weight is None else {"heliopsf:weight": parent.weight}
-            self.prov.used(activity, above, other_attributes={"prov:role": parent.type, **weight})
+            weight = [] if parent.weight is None else [("heliopsf:weight", parent.weight)]
+            self.prov.used(activity, above, other_attributes=[("prov:role", parent.type), *weight])
             self.prov.wasDerivedFrom(name, above, activity)
         return name
 
@@ -326,7 +329,7 @@ class _Document:
             self.prov.agent(name, [kind, ("voprov:name", "heliopsf"), ("heliopsf:version", version), *used])
         return name
 
-    def _parameter(self, activity: str, name: str, key: str, value: Any) -> None:
+    def _parameter(self, activity: str, name: str, key: str, value: object) -> None:
         text = value if isinstance(value, str) else json.dumps(value, sort_keys=True)
         kind = self._named("voprov:Parameter")
         self.prov.entity(name, {"prov:type": kind, "voprov:name": key, "prov:value": text})
@@ -334,7 +337,7 @@ class _Document:
             activity, name, other_attributes={"prov:type": self._named("voprov:WasConfiguredBy")}
         )
 
-    def _named(self, name: str) -> Any:
+    def _named(self, name: str) -> QualifiedName | None:
         return self.prov.valid_qualified_name(name)
 
     def _new(self, name: str) -> bool:
@@ -344,12 +347,12 @@ class _Document:
         return new
 
 
-def _entity_attributes(one: Ancestor, document: ProvDocument) -> dict[str, Any]:
+def _entity_attributes(one: Ancestor, document: ProvDocument) -> dict[str, Attribute]:
     made = one.made
     digest = one.id if made is None else made.file_sha256
     # The ids of uploads and instrument files are the SHA-256 of their bytes; that of a deleted result is not.
     known = made is not None or one.type in ("image", "transit", "instrument-file")
-    attributes: dict[str, Any] = {
+    attributes: dict[str, Attribute] = {
         "prov:type": document.valid_qualified_name("voprov:DatasetEntity"),
         "prov:label": f"{one.type} {one.id[:SHOWN_HASH]}",
         "heliopsf:sha256": digest if known else None,

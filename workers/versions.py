@@ -26,18 +26,18 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import StrEnum
 from pathlib import PurePath
-from typing import Any
 
 from psfcore.errors import DataError
-from psfcore.fits.cards import optional_text
+from psfcore.fits.cards import Cards, optional_text
 from psfcore.fits.frame import plate_scale_arcsec
 from psfcore.fits.header import FILTER_CARDS, HeaderSummary, bad_time, utc_time
 from psfcore.instruments.files import PLATE_SCALE_TOLERANCE
+from psfcore.instruments.observation import Observation
 from psfcore.instruments.unknown import channel_of as channel_of
 from workers.texts import printable
 
@@ -59,7 +59,7 @@ def series_of(instrument: str | None, channel: str | None, kind: str) -> str | N
     return f"{instrument}/{channel or '-'}/{kind}" if instrument else None
 
 
-def instrument_of(header: Mapping[str, Any]) -> str | None:
+def instrument_of(header: Observation) -> str | None:
     """The instrument in the summary of an upload's header.
 
     The result is the name of a known instrument, or else the card DETECTOR or INSTRUME, converted by ``word``.
@@ -88,7 +88,7 @@ def is_variant_of(channel: str, plain: str) -> bool:
     return channel.startswith(f"{plain}{SEPARATOR}") and len(channel) > len(plain) + 1
 
 
-def variant_for(cards: Mapping[str, Any], channels: Iterable[str]) -> str | None:
+def variant_for(cards: Cards, channels: Iterable[str]) -> str | None:
     """The channel, of these variants, to which an image belongs; None if no variant agrees with the image.
 
     All properties of the variant agree with the header of the image; if several variants agree, the image belongs to
@@ -108,7 +108,7 @@ def variant_for(cards: Mapping[str, Any], channels: Iterable[str]) -> str | None
     return best[0] if best else None
 
 
-def _has(cards: Mapping[str, Any], name: str) -> bool:
+def _has(cards: Cards, name: str) -> bool:
     """Whether an image has a property of a variant: a plate scale, or a filter."""
     scale = _SCALE.fullmatch(name)
     if scale is None:

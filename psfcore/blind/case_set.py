@@ -27,7 +27,6 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context, parent_process
 from pathlib import Path
-from typing import Any
 
 from psfcore.arrays import array_sha256
 from psfcore.blind.cases import DRAW, SetPlan, draw_case
@@ -109,7 +108,7 @@ class BlindSet:
         text = self.seals_file.read_text("utf-8") if self.seals_file.is_file() else ""
         write_whole(self.seals_file, text + json.dumps({"case": number, "sha256": seal}) + "\n")
 
-    def truth(self, number: int) -> dict[str, Any]:
+    def truth(self, number: int) -> dict[str, object]:
         """The truth of a case, after its seal was checked. Raises DataError "broken-seal", "bad-seals"."""
         seal = self.seals().get(number)
         try:

@@ -79,7 +79,7 @@ class Cause:
 
     case: DiagnosedCase
     effect: dict[str, Any]
-    bound: dict[str, Any] | None
+    bound: dict[str, float] | None
 
     @property
     def is_known(self) -> bool:
@@ -179,7 +179,7 @@ class Cause:
         correlation = float(np.corrcoef(true, values)[0, 1]) if both_vary else 0.0
         return float(np.hypot(*way)) / (size_px / 2), correlation
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, object]:
         """The judgement of the cause, as JSON."""
         return {
             **{key: self.effect[key] for key in ("name", "families", "strength", "left_alone_pct")},
@@ -230,7 +230,7 @@ class DiagnosedCase:
         first, second = (cause.right_entries(FAMILY) for cause in self.causes)
         return any(one is not other for one in first for other in second)
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, object]:
         """The judgement of the case, as JSON."""
         return {
             "case": self.number,

@@ -16,7 +16,7 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from statistics import mean, median
-from typing import Any
+from typing import TypedDict
 
 from psfcore.blind.case_set import BlindSet
 from psfcore.blind.cases import MIXED
@@ -39,7 +39,27 @@ NEAR = 0.15  # distance of the peak of a map from the true peak, in units of hal
 SLOWEST_S = 180.0
 Z95 = 1.959963984540054
 
-Row = dict[str, Any]
+
+class Row(TypedDict):
+    """A row of the table; None for what the cases do not give. wilson95: the ends of the interval of the value."""
+
+    figure: str
+    n: int
+    value: float | None
+    wilson95: list[float] | None
+    bound: float | None
+    goal: str
+    met: bool | None
+
+
+class Score(TypedDict):
+    """The score of a blind set."""
+
+    schema: str
+    judged: int
+    failures: dict[str, str]
+    rows: list[Row]
+    cases: list[dict[str, object]]
 
 
 def wilson(hits: float, cases: int) -> tuple[float, float]:
@@ -148,7 +168,7 @@ def _over_bound(figure: str, causes: Sequence[Cause], level: str, least: float) 
     return row(figure, _right(causes, level), least, expected=_bounds(causes, level))
 
 
-def score(cases: Sequence[DiagnosedCase], failures: Mapping[int, str]) -> dict[str, object]:
+def score(cases: Sequence[DiagnosedCase], failures: Mapping[int, str]) -> Score:
     """The score of the cases that have a report, as JSON (gap-blind/3).
 
     failures: the reasons why the other cases have no report, by number.
@@ -162,7 +182,7 @@ def score(cases: Sequence[DiagnosedCase], failures: Mapping[int, str]) -> dict[s
     }
 
 
-def table(found: Mapping[str, Any]) -> str:
+def table(found: Score) -> str:
     """The table of a score as plain text."""
     lines = [f"{'figure':<50}{'n':>5}{'value':>9}  {'95 % (Wilson)':<16}{'bound':<8}{'goal':<13}met"]
     for one in found["rows"]:

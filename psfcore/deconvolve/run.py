@@ -34,7 +34,7 @@ from psfcore.fits.images import described, write_image
 from psfcore.fits.observation import check_exposure_of_sun
 from psfcore.fits.units import unit_label
 from psfcore.image import Image, MaskBit
-from psfcore.instruments.psf_statements import caveats, title
+from psfcore.instruments.psf_statements import caveats, published_with_scatter, title
 from psfcore.psf import REACH_GRID_PX, Psf
 from psfcore.psf_sampling import with_scale
 
@@ -161,6 +161,9 @@ class Product(Deconvolved):
                 "version": psf.version,
                 "status": psf.status,
                 "assumed": caveats(psf.name, self.psf.instrument, provenance or self.psf.provenance),
+                "published": published_with_scatter(
+                    psf.name, self.psf.instrument, provenance or self.psf.provenance
+                ),
             },
             "steps_done": self.steps_done,
             "stopped_because": self.stopped_because,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from psfcore.instruments.psf_statements import title
+from psfcore.instruments.psf_statements import offer, title
 
 
 def summary_lines(details: Mapping[str, Any]) -> list[str]:
@@ -13,7 +13,7 @@ def summary_lines(details: Mapping[str, Any]) -> list[str]:
     psf, noise, region = details["psf"], details["noise"], details["region"]
     lines = [
         f"{details['image']}, {title(psf['name'], psf['version'], psf['status'])}",
-        *([f"of this PSF: {'; '.join(psf['assumed'])}"] if psf["assumed"] else []),
+        *([f"caveats of the PSF: {'; '.join(psf['assumed'])}"] if psf["assumed"] else []),
         f"{steps_done(details)}: flux {percent(details['flux_change_pct'], 3)}, brightest 1 % of pixels "
         f"{percent(details['bright_change_pct'])}, darkest 1 % {percent(details['dark_change_pct'])}",
     ]
@@ -23,6 +23,8 @@ def summary_lines(details: Mapping[str, Any]) -> list[str]:
         )
     if noise is not None:
         lines.append(f"errors from the noise: {noise['text']}")
+    if psf.get("published"):  # products of earlier versions have no such entry
+        lines.append(f"better: {offer(psf['published'])}")
     return lines
 
 
@@ -40,10 +42,10 @@ def region_error(error_pct: float | None) -> str:
     )
 
 
-def steps_done(details: Mapping[str, Any]) -> str:
+def steps_done(details: Mapping[str, object]) -> str:
     """The number of steps, and why there were no more, if the request allowed more."""
-    stopped = "" if details["stopped_because"].startswith("all ") else f" ({details['stopped_because']})"
-    steps = details["steps_done"]
+    because, steps = str(details["stopped_because"]), details["steps_done"]
+    stopped = "" if because.startswith("all ") else f" ({because})"
     return f"{steps} step{'' if steps == 1 else 's'}{stopped}"
 
 

@@ -31,7 +31,6 @@ import queue
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -178,7 +177,7 @@ def _turns(turns: NDArray[np.floating]) -> Single:
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1).astype(np.float32)
 
 
-_FAST: Any = {"contract"}
+_FAST: set[str] = {"contract"}
 _W = np.uint64(LANES)
 
 

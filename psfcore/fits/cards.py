@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from functools import cache
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from psfcore.errors import HeaderError
 
@@ -26,7 +26,7 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d{1,3})?")
 class Cards(Protocol):
     """Header cards by keyword: the header of a file, or the cards of it that the catalogue stores."""
 
-    def __getitem__(self, key: str, /) -> Any:
+    def __getitem__(self, key: str, /) -> object:
         """The value of a card. Raises KeyError if there is no such card."""
 
 

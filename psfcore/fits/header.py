@@ -9,10 +9,13 @@ from __future__ import annotations
 import math
 import os
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from typing_extensions import TypedDict
 
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits, Hdu, first_image, open_source, skip_data, walk
@@ -30,6 +33,7 @@ from psfcore.fits.cards import (
 )
 from psfcore.fits.frame import frame_of, plate_scale_arcsec
 from psfcore.instruments.files import match_instrument
+from psfcore.instruments.observation import Observation
 
 if TYPE_CHECKING:
     from astropy.io.fits import Card, Header
@@ -79,6 +83,27 @@ _FIT_CARDS = (
     "CDELT1", "CDELT2", "CUNIT1", "CUNIT2", "CTYPE1", "CTYPE2", "CD1_1", "CD1_2", "CD2_1", "CD2_2", "PC1_1", "PC1_2",
     "PC2_1", "PC2_2", "CROTA", "CROTA1", "CROTA2", "SAT_ROT", "INST_ROT", "P2_ROLL", "SC_ROLL",
 )  # fmt: skip
+
+
+class HduJson(TypedDict):
+    """The first values of a `HeaderSummary` as JSON: those of the HDU."""
+
+    hdu: int
+    shape: Sequence[int]
+    bitpix: int
+    codec: str | None
+    gzipped: bool
+
+
+class HeaderJson(HduJson, Observation):
+    """A `HeaderSummary` as JSON."""
+
+    pxbeg: Sequence[int] | None
+    pxend: Sequence[int] | None
+    psf_name: str | None
+    psf_version: str | None
+    content: str
+    cards: dict[str, str | float | bool]
 
 
 @dataclass(frozen=True)
@@ -219,10 +244,8 @@ def optional_exposure_s(header: Cards) -> float | None:
     return next((exposure for exposure in exposures if exposure > 0), None)
 
 
-def seen_by(header: Cards) -> dict[str, Any]:
-    """The values of a header that describe the observation: the fields of `HeaderSummary` from instrument to
-    gain_mode.
-    """
+def seen_by(header: Cards) -> Observation:
+    """The values of a header that describe the observation."""
     scale_x, scale_y = frame_of(header).scale_arcsec
     return {
         "instrument": known_instrument(header),

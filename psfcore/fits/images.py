@@ -136,7 +136,7 @@ def write_image(
     *,
     cards: Cards,
     history: Sequence[str] = (),
-    planes: Mapping[str, NDArray[np.generic]] | None = None,
+    planes: Mapping[str, NDArray[Any]] | None = None,
     plane_bits: Mapping[str, Meanings] | None = None,
 ) -> None:
     """Write a product: float32 pixels, the input's header with its WCS, `cards`, `history` and planes.
@@ -168,7 +168,7 @@ def write_image(
     write_hdus(path, hdus)
 
 
-def write_plane(path: str | Path, pixels: NDArray[np.generic], *, cards: Cards) -> None:
+def write_plane(path: str | Path, pixels: NDArray[Any], *, cards: Cards) -> None:
     """Write pixels [y, x] and `cards` to a file. Integers are stored as int32, floats as float32."""
     hdu = fits.PrimaryHDU(pixels.astype(np.int32 if pixels.dtype.kind in "iu" else np.float32))
     hdu.header.update(_ascii(cards))
@@ -184,7 +184,7 @@ def _ascii(cards: Cards) -> dict[str, tuple[CardValue, str]]:
 
 def _plane_hdu(
     name: str,
-    plane: NDArray[np.generic],
+    plane: NDArray[Any],
     image_header: fits.Header,
     unit: str | None,
     meanings: Meanings | None,
@@ -210,9 +210,7 @@ def _plane_hdu(
     return hdu
 
 
-def _check_plane(
-    name: str, plane: NDArray[np.generic], shape: tuple[int, ...], *, taken: Sequence[str]
-) -> None:
+def _check_plane(name: str, plane: NDArray[Any], shape: tuple[int, ...], *, taken: Sequence[str]) -> None:
     """Raise DataError "bad-plane" for a wrong shape or type, or a name that is not allowed or in `taken`."""
     if not re.fullmatch(r"[A-Z][A-Z0-9_]{0,31}", name) or name in taken:
         raise DataError(
@@ -269,7 +267,7 @@ def _image_of(card: fits.Card) -> str:
     return str(repaired.image)
 
 
-def _card_value(card: fits.Card) -> Any:
+def _card_value(card: fits.Card) -> object:
     try:
         value = card.value
     except VerifyError:

@@ -201,7 +201,7 @@ def check_written(_target: BinaryIO, *, path: str, count: int) -> dict[str, obje
 
 def _read_extras(
     path: str | Path, limits: FitsLimits, shape: tuple[int, ...]
-) -> tuple[dict[str, NDArray[np.float64]], dict[str, Any], FittedShape | None]:
+) -> tuple[dict[str, NDArray[np.float64]], dict[str, object], FittedShape | None]:
     """Components, provenance and fitted shape of a file that `write_psf` wrote."""
     # Any file can have a card PSFNAME. Therefore the size limits are checked for all HDUs.
     hdus = all_hdus(path, limits)

@@ -11,11 +11,14 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from psfcore.errors import DataError
 from psfcore.fits.cards import LONGEST_TEXT, Cards, history_of, optional_text
 from psfcore.image import Image
+
+if TYPE_CHECKING:
+    from astropy.units import UnitBase
 
 Kind = Literal["count", "rate", "other", "unknown"]
 _MANY_DIGITS = re.compile(r"\d{4}")
@@ -119,7 +122,7 @@ def dn_per_unit(image: Image) -> float:
     return 1.0 if unit.kind == "other" else per_dn(unit, image.exposure_s, "to compute the noise")
 
 
-def _parsed(text: str) -> Any:
+def _parsed(text: str) -> UnitBase | None:
     """The unit of astropy with all counts as `ct`; None if the text is no unit that astropy reads."""
     from astropy import units
 

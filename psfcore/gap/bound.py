@@ -21,9 +21,9 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from psfcore.build import known_diffraction
@@ -85,7 +85,7 @@ def bounds(without: Transit, causes: Sequence[TrueCause], seed: int = 1) -> tupl
 def _true_effect(number: int, cause: TrueCause, without: Transit) -> Effect:
     """The true change by a cause, as an effect whose parameter is 1."""
 
-    def change(n: int, images: object) -> Any:
+    def change(n: int, images: object) -> NDArray[np.float32]:
         return cause.transit.frames[n].pixels - without.frames[n].pixels
 
     return Effect(

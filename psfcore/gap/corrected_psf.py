@@ -57,8 +57,15 @@ def corrected_psf(found: Diagnosis, name: str, version: str, provenance: dict[st
         "inputs_sha256": added.solution.transit.sha256,
     }
     scatter = inversion.shape.kernel(inversion.coordinates, REACH_GRID_PX)
-    named = {"name": name, "version": version, "provenance": provenance | history}
-    return psf_of_fit(_kernel(added), scatter, added.solution, added.covariance, **named)
+    return psf_of_fit(
+        _kernel(added),
+        scatter,
+        added.solution,
+        added.covariance,
+        name=name,
+        version=version,
+        provenance=provenance | history,
+    )
 
 
 def _kernel(added: Corrected) -> Kernel:

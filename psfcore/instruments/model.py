@@ -35,7 +35,7 @@ from psfcore.instruments.files import instrument_path, parse_toml
 MM_PER_ANGSTROM, MM_PER_UM, UM_PER_ANGSTROM, UM_PER_MM = 1e-7, 1e-3, 1e-4, 1e3
 
 
-def _no_text(value: Any) -> Any:
+def _no_text(value: object) -> object:
     """Refuse a text and a boolean, which pydantic would convert to a whole number."""
     if isinstance(value, str | bool):
         raise ValueError("expected a whole number")

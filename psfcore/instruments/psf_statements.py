@@ -12,12 +12,12 @@ This module imports no numerical library, so that the web process can import it.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TypeVar
 
 from psfcore.instruments.files import instrument_names, instrument_path, telescope_of
 from psfcore.instruments.model import Instrument, load_instrument
-from psfcore.instruments.published import published_for
+from psfcore.instruments.published import PUBLISHED, published_for
 
 Curve = TypeVar("Curve")
 DRAFT = "draft"
@@ -80,6 +80,21 @@ def scatter_left(name: str, instrument: str | None, provenance: Mapping[str, obj
         return None
     share = _DIFFUSE_LIGHT.get(telescope_of(name)) if name in instrument_names() else None
     return f"the diffusely scattered light stays in the image ({share or 'its share is not known'})"
+
+
+def published_with_scatter(name: str, instrument: str | None, provenance: Mapping[str, object]) -> list[str]:
+    """The names of the published PSFs that contain the scattered light that a deconvolution with this PSF leaves."""
+    if name not in instrument_names() or scatter_left(name, instrument, provenance) is None:
+        return []
+    return [one.name for one in PUBLISHED.values() if one.instrument == name and "scatter" in one.contains]
+
+
+def offer(published: Sequence[str]) -> str:
+    """How to use one of the published PSFs of these names, which contain the scattered light that a PSF leaves."""
+    return (
+        f"the published PSF {' or '.join(published)} contains this light: `heliopsf psf get {published[0]}` brings it, "
+        "--psf published uses it"
+    )
 
 
 def caveats(name: str, instrument: str | None, provenance: Mapping[str, object]) -> list[str]:

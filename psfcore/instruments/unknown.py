@@ -9,11 +9,12 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal, TypedDict
 
 from psfcore.errors import DataError
 from psfcore.instruments.files import PLATE_SCALE_TOLERANCE, WAVELENGTH_TOLERANCE, instrument_names
 from psfcore.instruments.model import load_instrument
+from psfcore.instruments.observation import Observation
 from psfcore.instruments.psf_statements import published_text
 
 WAYS = (
@@ -37,6 +38,7 @@ WAYS = (
 _NAMES = {"telescope": "telescope", "channel": "channel", "plate_scale": "pixel scale"}
 
 
+Card = Literal["telescop", "instrume", "detector"]
 Way = Literal["name", "upload", "fit"]  # the steps that `WAYS` describes
 
 _NO_SOURCE = (
@@ -44,6 +46,31 @@ _NO_SOURCE = (
     "diffuse scatter"
 )
 _ASK = "ask the authors for it as a FITS image, and upload it"
+
+
+class Suited(TypedDict):
+    """A PSF or an instrument that could suit an image: the properties that agree, and a text that compares all."""
+
+    name: str
+    same: list[str]
+    told: str
+
+
+class SuitedPsf(Suited):
+    """A PSF of the catalogue that could suit an image."""
+
+    id: str
+    version: str
+    status: str
+    instrument: str | None
+    channel: str | None
+
+
+class SuitedInstrument(Suited):
+    """An instrument whose PSF can be built and could suit an image."""
+
+    wavelength_angstrom: float
+    plate_scale_arcsec: float
 
 
 @dataclass(frozen=True)
@@ -57,12 +84,12 @@ class Telescope:
     """
 
     name: str
-    cards: tuple[Mapping[str, str], ...]
+    cards: tuple[Mapping[Card, str], ...]
     reason: str
     ways: Mapping[Way, str]
     angstrom: tuple[float, ...] = ()
 
-    def took(self, header: Mapping[str, Any]) -> bool:
+    def took(self, header: Observation) -> bool:
         """Whether the image with this header summary is of this telescope."""
         wavelength = header["wavelnth"] or 0.0
         if self.angstrom and all(abs(wavelength / one - 1) > WAVELENGTH_TOLERANCE for one in self.angstrom):
@@ -147,7 +174,7 @@ TELESCOPES = (
 )
 
 
-def telescope_without_file(header: Mapping[str, Any]) -> Telescope | None:
+def telescope_without_file(header: Observation) -> Telescope | None:
     """The telescope without an instrument file that took the image with this header summary, or None."""
     return next((one for one in TELESCOPES if one.took(header)), None)
 
@@ -165,7 +192,7 @@ def channel_of(instrument: str | None, wavelength_angstrom: float | None) -> str
     return str(round(wavelength_angstrom))
 
 
-def unknown_instrument(header: Mapping[str, Any], psfs: Sequence[Mapping[str, Any]] = ()) -> DataError:
+def unknown_instrument(header: Observation, psfs: Sequence[SuitedPsf] = ()) -> DataError:
     """The error "no-psf-for-instrument" for an image with this header summary (`psfcore.fits.header.HeaderSummary` as a
     table).
 
@@ -200,7 +227,7 @@ def unknown_instrument(header: Mapping[str, Any], psfs: Sequence[Mapping[str, An
     )
 
 
-def _seen(named: str, telescope: Telescope | None, header: Mapping[str, Any]) -> str:
+def _seen(named: str, telescope: Telescope | None, header: Observation) -> str:
     """The telescope and the channel of an image, for a message. named: the words of its header cards."""
     channel = channel_of(None, header["wavelnth"])
     cards = f"'{named or 'an unnamed instrument'}'"
@@ -209,14 +236,17 @@ def _seen(named: str, telescope: Telescope | None, header: Mapping[str, Any]) ->
     )
 
 
-def _lacking(named: str, instruments: Sequence[Mapping[str, Any]], header: Mapping[str, Any]) -> str | None:
+def _lacking(named: str, instruments: Sequence[SuitedInstrument], header: Observation) -> str | None:
     """The cards without which the telescope or the channel of an image is not known; None if they are there."""
     if not named:
         return "its header names no telescope (cards TELESCOP, INSTRUME)"
     if header["wavelnth"] is not None or not any("telescope" in one["same"] for one in instruments):
         return None
-    cards = header.get("cards", {})  # only summaries of files have them
-    given = "".join(f"; got {key} = {cards[key]!r:.40}" for key in ("WAVELNTH", "WAVEUNIT") if key in cards)
+    cards = header.get("cards")  # only summaries of files have them
+    named_cards = cards if isinstance(cards, dict) else {}
+    given = "".join(
+        f"; got {key} = {named_cards[key]!r:.40}" for key in ("WAVELNTH", "WAVEUNIT") if key in named_cards
+    )
     return (
         "its header gives no wavelength that can be read: expected a number in the card WAVELNTH, and its unit, "
         f"such as angstrom or nm, in WAVEUNIT{given}"
@@ -253,7 +283,7 @@ def _ways(telescope: Telescope | None, wavelength_angstrom: float | None) -> lis
     ]
 
 
-def _instrument(name: str, header: Mapping[str, Any]) -> dict[str, Any]:
+def _instrument(name: str, header: Observation) -> SuitedInstrument:
     instrument = load_instrument(name)
     scale = instrument.detector.plate_scale_arcsec
     channel = channel_of(None, instrument.wavelength_angstrom)
@@ -268,7 +298,7 @@ def _instrument(name: str, header: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def agreement(
-    instrument: str | None, channel: str | None, plate_scale_arcsec: float | None, header: Mapping[str, Any]
+    instrument: str | None, channel: str | None, plate_scale_arcsec: float | None, header: Observation
 ) -> tuple[list[str], str]:
     """The properties that a PSF and an image have in common, of "telescope", "channel" and "plate_scale"; and a text
     that compares both, for example "same telescope, but another channel".

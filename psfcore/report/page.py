@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -50,7 +49,7 @@ _CONSTANTS = {
 }
 
 
-def report_page(report: PsfReport, provenance: dict[str, Any]) -> Page:
+def report_page(report: PsfReport, provenance: dict[str, object]) -> Page:
     """The page of a report. provenance: names and values, possibly nested, that describe software and request."""
     of = report.transit.instrument or "an unnamed instrument"
     inputs = inputs_of(report)

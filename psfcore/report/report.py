@@ -110,7 +110,7 @@ class PsfReport:
         """The summary at the top of the report."""
         judged = sentence(self.evaluation)
         if self.fit is not None:
-            return str(fit_json(self.fit)["sentence"] + f" {self.how_judged}. {judged}")
+            return f"{fit_json(self.fit)['sentence']} {self.how_judged}. {judged}"
         return f"{title(self.psf.name, self.psf.version, None)}. {self.how_judged}. {judged}"
 
     @property
@@ -276,9 +276,9 @@ class _ReportProgress:
 # --- as JSON ----------------------------------------------------------------------------------------------
 
 
-def report_json(report: PsfReport, provenance: dict[str, Any]) -> dict[str, Any]:
+def report_json(report: PsfReport, provenance: dict[str, object]) -> dict[str, Any]:
     """All numbers of a report as JSON. provenance: the caller's description of software and request."""
-    out: dict[str, Any] = {
+    out: dict[str, object] = {
         "schema": SCHEMA,
         "sentence": report.sentence,
         "psf": {

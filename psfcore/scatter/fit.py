@@ -27,7 +27,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -352,14 +352,30 @@ def _counted(count: int, noun: str) -> str:
 
 def fitted_psf(fit: TransitFit, *, name: str, version: str, provenance: dict[str, object]) -> Psf:
     """The fitted PSF, on the full reach (2048 px x 2048 px), with its components DIFFRACTION and SCATTER."""
-    named = {"name": name, "version": version, "provenance": provenance}
-    return psf_of_fit(fit.kernel, fit.scatter, fit.solution, fit.covariance, **named)
+    return psf_of_fit(
+        fit.kernel,
+        fit.scatter,
+        fit.solution,
+        fit.covariance,
+        name=name,
+        version=version,
+        provenance=provenance,
+    )
 
 
-def psf_of_fit(kernel: Kernel, scatter: Kernel, solution: Solution, covariance: Matrix, **named: Any) -> Psf:
+def psf_of_fit(
+    kernel: Kernel,
+    scatter: Kernel,
+    solution: Solution,
+    covariance: Matrix,
+    *,
+    name: str,
+    version: str,
+    provenance: dict[str, object],
+) -> Psf:
     """A draft PSF with the fitted shape of a solution and the components DIFFRACTION and SCATTER.
 
-    covariance: of the coordinates. named: further fields of `Psf`.
+    covariance: of the coordinates.
     """
     transit, inversion = solution.transit, solution.inversion
     diffraction = crop_or_pad(transit.diffraction, kernel.shape[0])
@@ -375,11 +391,13 @@ def psf_of_fit(kernel: Kernel, scatter: Kernel, solution: Solution, covariance: 
             coordinates=tuple(inversion.coordinates.tolist()),
             covariance=tuple(tuple(row) for row in covariance.tolist()),
         ),
-        **named,
+        name=name,
+        version=version,
+        provenance=provenance,
     )
 
 
-def fit_json(fit: TransitFit) -> dict[str, Any]:
+def fit_json(fit: TransitFit) -> dict[str, object]:
     """The fit as JSON: parameters and curves with errors, every image, the alternative fits, and the limits."""
     inversion = fit.inversion
     values, sigma = inversion.values, fit.value_sigma

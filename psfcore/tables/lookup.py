@@ -97,7 +97,7 @@ def profile(tables: Tables) -> dict[str, Any]:
     }
 
 
-def encircled(tables: Tables, radius: float) -> dict[str, Any]:
+def encircled(tables: Tables, radius: float) -> dict[str, object]:
     """The encircled energy within a radius, as a fraction of all light, by component.
 
     Raises DataError "bad-radius", "radius-beyond-reach".
@@ -112,7 +112,7 @@ def encircled(tables: Tables, radius: float) -> dict[str, Any]:
     }
 
 
-def annulus(tables: Tables, inner: float, outer: float) -> dict[str, Any]:
+def annulus(tables: Tables, inner: float, outer: float) -> dict[str, object]:
     """The light at inner < r <= outer, as a fraction of all light, by component.
 
     Raises DataError "bad-annulus", "bad-radius", "radius-beyond-reach".

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -38,9 +38,19 @@ Result = TypeVar("Result")
 KernelSource = Kernel | Callable[[str | None, tuple[int, int]], Kernel]
 
 
-def read_transit(folder: str | Path, limits: FitsLimits, **options: Any) -> Transit:
+def read_transit(
+    folder: str | Path,
+    limits: FitsLimits,
+    *,
+    progress: Progress | None = None,
+    diffraction: KernelSource | None = None,
+    noise: Noise | None = None,
+    saturation_dn: float | None = None,
+) -> Transit:
     """Read the transit in a folder; options and errors as in ``read_prepared``, but no counts are returned."""
-    return read_prepared(folder, limits, **options)[0]
+    return read_prepared(
+        folder, limits, progress=progress, diffraction=diffraction, noise=noise, saturation_dn=saturation_dn
+    )[0]
 
 
 def read_prepared(

@@ -8,7 +8,7 @@ import csv
 import io
 import logging
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Path, Query, Response
 from fastapi.responses import StreamingResponse
@@ -64,7 +64,7 @@ class BulkView(RowView):
         description="id of the PSF of all images; null: the context pins a PSF for each image"
     )
     context_id: str | None
-    request: dict[str, Any] = Field(description="the request, without the ids of uploaded images")
+    request: dict[str, object] = Field(description="the request, without the ids of uploaded images")
     listed: bool = Field(
         description="whether all files are listed; false: the numbers of images and of waiting images are too small"
     )
@@ -201,7 +201,7 @@ class Result(RowView):
         }
         return cls.of_columns(row, **{"seconds": None, "kernel_seconds": None, **statistics, **addresses})
 
-    def flat(self) -> dict[str, Any]:
+    def flat(self) -> dict[str, object]:
         """The values of a CSV row."""
         row = self.model_dump(exclude=NESTED) | {"warnings": " ".join(self.warnings)}
         for kind in CHANGES:
@@ -416,7 +416,7 @@ def _table(batches: Iterator[list[Result]]) -> Iterator[str]:
         yield _rows([list(result.flat().values()) for result in batch])
 
 
-def _rows(rows: Sequence[Sequence[Any]]) -> str:
+def _rows(rows: Sequence[Sequence[object]]) -> str:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue()

@@ -19,7 +19,7 @@ from __future__ import annotations
 import time
 from collections.abc import AsyncIterator, Callable
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Header, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
@@ -33,7 +33,7 @@ from service.api.jobs import JobId
 from service.api.jobs import find as find_job
 from service.http.callers import Caller, Reading, still_let_in
 from service.http.lookout import Follower, Key, Lookout, OwnerFollower, StreamKind, version
-from service.http.problems import RESPONSES
+from service.http.problems import RESPONSES, Descriptions
 from service.http.state import Shared
 from service.views import JobView
 from workers.catalogue.tables import BulkRow, JobRow
@@ -47,7 +47,7 @@ router = APIRouter(tags=["events"], responses=RESPONSES)
 LastId = Annotated[str | None, Header(alias="Last-Event-ID", max_length=64)]
 Id = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{32}$")]
 Moment = Annotated[str | None, Header(alias="Last-Event-ID", pattern=r"^[0-9]{1,12}\.[0-9]{3}$")]
-STREAM: dict[int | str, dict[str, Any]] = {
+STREAM: Descriptions = {
     200: {
         "description": "Events `progress`. The data of each event is the complete job or bulk run. The last event is "
         "`end`.",
@@ -55,7 +55,7 @@ STREAM: dict[int | str, dict[str, Any]] = {
     },
     204: {"description": "The last event that the client received was `end`; no more events follow."},
 }
-STREAM_OF_OWNER: dict[int | str, dict[str, Any]] = {
+STREAM_OF_OWNER: Descriptions = {
     200: {
         "description": "Events `job` and `bulk` are sent for new and changed jobs and bulk runs; the data is the "
         "complete job "
@@ -112,11 +112,15 @@ def _stream(request: Request, state: Shared, caller: Caller, follower: Follower)
     state.streams.open(caller.account)
     ends_at = time.monotonic() + state.settings.stream_s
     catalogue = state.catalogue
-    kinds: list[StreamKind[Any]] = [
-        StreamKind("job", catalogue.job_changes, JobView.of),
-        StreamKind("bulk", catalogue.bulk_changes, partial(BulkView.of, state=state)),
-    ]
-    lookout = Lookout(caller.owner, kinds, catalogue.clock, partial(still_let_in, state))
+    lookout = Lookout(
+        caller.owner,
+        [
+            StreamKind("job", catalogue.job_changes, JobView.of),
+            StreamKind("bulk", catalogue.bulk_changes, partial(BulkView.of, state=state)),
+        ],
+        catalogue.clock,
+        partial(still_let_in, state),
+    )
     lookout = state.lookouts.setdefault(caller.owner, lookout)
 
     async def texts() -> AsyncIterator[str]:

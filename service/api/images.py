@@ -4,7 +4,7 @@ products their lineage, ``.../lineage`` and ``.../provenance``, and reruns, ``..
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import Field
@@ -14,7 +14,7 @@ from service.http import files
 from service.http.callers import Reading, Submitting
 from service.http.gate import in_turn
 from service.http.paging import Page, Paging
-from service.http.problems import RESPONSES
+from service.http.problems import RESPONSES, RouteOptions
 from service.http.state import Shared
 from service.views import JobView, ProductView, RowView
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow
@@ -27,7 +27,7 @@ from workers.lineage import Ancestor, Format, lineage, provenance_text
 MEDIA_TYPES: dict[Format, str] = {"json": "application/json", "provn": "text/provenance-notation"}
 FILES: dict[Format, str] = {"json": "prov.json", "provn": "provn"}
 FORMAT = Query(description="`json`: PROV-JSON; `provn`: PROV-N")
-PROV: dict[str, Any] = {
+PROV: RouteOptions = {
     "response_class": Response,
     "responses": {
         200: {
@@ -51,7 +51,7 @@ class ImageView(RowView):
     created_at: float
     bytes: int
     filename: str | None
-    header: dict[str, Any] = Field(description="summary of the FITS header")
+    header: dict[str, object] = Field(description="summary of the FITS header")
 
     @classmethod
     def of(cls, row: ImageRow) -> ImageView:

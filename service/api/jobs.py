@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from typing import Annotated, Any, cast
+from typing import Annotated, cast
 
 from fastapi import APIRouter, Path, Response
 from pydantic import BaseModel, Field
@@ -36,13 +36,17 @@ class Identified(BaseModel):
     """The identity of the result of a request."""
 
     result_id: str = Field(description="id that the result has, or would have")
-    parameters: dict[str, Any] = Field(description="the parameters, with every default and the PSF filled in")
+    parameters: dict[str, object] = Field(
+        description="the parameters, with every default and the PSF filled in"
+    )
 
 
 class EstimateView(BaseModel):
     """The estimate for a request. The request is not submitted."""
 
-    parameters: dict[str, Any] = Field(description="the parameters, with every default and the PSF filled in")
+    parameters: dict[str, object] = Field(
+        description="the parameters, with every default and the PSF filled in"
+    )
     result_id: str = Field(
         description="id that the result has, or would have; for a kind whose jobs always make a new result (`rerun`), "
         "this id is different each time"
@@ -95,7 +99,9 @@ def submit_job(body: JobRequest, response: Response, caller: Submitting, state: 
     return _view(row, state)
 
 
-def prepared(body: JobRequest, caller: Caller, state: Shared) -> tuple[dict[str, Any], str, dict[str, Any]]:
+def prepared(
+    body: JobRequest, caller: Caller, state: Shared
+) -> tuple[dict[str, object], str, dict[str, float]]:
     """The resolved parameters of a request, the identity of its result, and its estimate as JSON.
 
     Raises ``Problem`` if the request cannot be accepted.
@@ -107,7 +113,7 @@ def prepared(body: JobRequest, caller: Caller, state: Shared) -> tuple[dict[str,
     return parameters, identity, estimate
 
 
-def _resolved(body: JobRequest, caller: Caller, state: Shared) -> tuple[dict[str, Any], str]:
+def _resolved(body: JobRequest, caller: Caller, state: Shared) -> tuple[dict[str, object], str]:
     with as_problems():
         return resolve(body, state.catalogue, caller.owner, added_effects=state.settings.added_effects)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Annotated, Any, BinaryIO, Literal
+from typing import Annotated, BinaryIO, Literal
 
 from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
@@ -21,7 +21,7 @@ from psfcore.fits.viewing.planes import Decoded, Plane, decode_plane
 from service.client.answers import HduHeader
 from service.http import files
 from service.http.callers import Reading
-from service.http.problems import RESPONSES, Problem, as_problems
+from service.http.problems import RESPONSES, Descriptions, Problem, as_problems
 from service.http.quotas import check_disk
 from service.http.state import Shared, State
 from workers.catalogue.tables import ImageRow, ProductRow
@@ -68,7 +68,7 @@ class Part:
 
 Window = Annotated[Part, Depends()]
 SHAPE = {"type": "string", "pattern": r"^\d+,\d+$"}
-DESCRIBED: dict[int | str, dict[str, Any]] = {
+DESCRIBED: Descriptions = {
     200: {
         "description": "float32 numbers, little-endian, row after row, row 0 of the window first; NaN: no value",
         "content": {MEDIA_TYPE: {"schema": {"type": "string", "format": "binary"}}},

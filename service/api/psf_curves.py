@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO, cast
+from typing import Annotated, BinaryIO, cast
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
@@ -122,7 +122,7 @@ def tables_of(state: State, caller: Caller, psf_id: str) -> psf_lookup.Tables:
 
 
 def _answer(
-    request: Request, caller: Caller, state: Shared, psf_ids: list[str], ask: Callable[..., dict[str, Any]]
+    request: Request, caller: Caller, state: Shared, psf_ids: list[str], ask: Callable[..., dict[str, object]]
 ) -> Response:
     """The answer from the tables of these PSFs, or 304 if the client already has this answer."""
     rows = [state.row(PsfRow, psf_id, caller.owner) for psf_id in psf_ids]

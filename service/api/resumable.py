@@ -10,7 +10,7 @@ from __future__ import annotations
 import base64
 import binascii
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from email.utils import formatdate
 from typing import Annotated, Any, BinaryIO
@@ -33,7 +33,7 @@ router = APIRouter(prefix="/v1/uploads", tags=["uploads"], responses=RESPONSES)
 UploadId = Annotated[str, Path(pattern=r"^[0-9a-f]{32}$")]
 VERSION = "1.0.0"
 EXTENSIONS = "creation,termination,expiration,checksum"
-ALGORITHMS: dict[str, Callable[[], Any]] = {
+ALGORITHMS = {
     "sha256": hashlib.sha256,
     "sha1": hashlib.sha1,
     "md5": hashlib.md5,
@@ -42,7 +42,7 @@ PART = "application/offset+octet-stream"
 KINDS: dict[str, files.UploadKind[Any]] = {"transit": files.TRANSIT, "image": files.IMAGE}
 
 
-def _header(name: str, description: str | None = None, *, required: bool = True) -> dict[str, Any]:
+def _header(name: str, description: str | None = None, *, required: bool = True) -> dict[str, object]:
     """The OpenAPI description of a header."""
     described = {} if description is None else {"description": description}
     return {"name": name, "in": "header", "required": required, "schema": {"type": "string"}, **described}

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -95,7 +95,7 @@ def submit(
     conditions: tuple[tuple[str, str, Value], ...],
     dry_run: bool,
     wait: bool,
-    **parameters: Any,
+    **parameters: object,
 ) -> None:
     """Start a bulk run: deconvolve the files on the machine of the service that match PATTERNS.
 
@@ -130,7 +130,7 @@ def submit(
         **treatment(**parameters),
     }
     if dry_run:
-        estimate = service.estimate_bulk(**request)
+        estimate = service.estimate_bulk(sample=None, **request)
         _print_estimate(estimate)
         sys.exit(1 if estimate["refused_images"] else 0)
     run = service.submit_bulk(**request)

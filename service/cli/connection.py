@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import TYPE_CHECKING, TypeVar, cast
 
 import click
 from click.shell_completion import CompletionItem
@@ -16,7 +16,7 @@ from click.shell_completion import CompletionItem
 from psfcore.errors import did_you_mean
 from psfcore.instruments.files import instrument_names
 from psfcore.instruments.published import PUBLISHED
-from psfcore.published_psfs import kept_file
+from psfcore.published_psfs import PUBLISHED_OF_IMAGE, kept_file, published_of
 from service.cli.options import LOCAL, Command, is_local, kept, options_of
 from service.cli.progress import echo, say
 from service.client.errors import DEFAULT_SERVER, SHOWN_DIGITS
@@ -55,7 +55,7 @@ class _Id(click.ParamType):
             return text
         if _ID.fullmatch(text.lower()):
             return text.lower()
-        names = [*instrument_names(), *PUBLISHED] if self.or_instrument else []
+        names = [PUBLISHED_OF_IMAGE, *instrument_names(), *PUBLISHED] if self.or_instrument else []
         if text in names:
             return text
         expected = f"a PSF id ({_DIGITS}) or a file" if self.or_file else f"an id, or its first {_DIGITS}"
@@ -76,22 +76,18 @@ def server_option(what: str, *, or_local: bool = False) -> Callable[[Command], C
 
     The command does not get their values: `connection`, `remote` and `is_local` find them in the context.
     """
-    key = click.option(
+    key = kept(_KEY)(
         "--key",
         envvar="HELIOPSF_KEY",
-        **kept(_KEY),
         help="Access key. Other users can read command lines, so set HELIOPSF_KEY instead",
     )
-    server = click.option(
+    server = kept(CHOSEN_SERVER)(
         "--server",
         metavar="ADDRESS",
         envvar="HELIOPSF_SERVER",
-        **kept(CHOSEN_SERVER),
         help=f"{what} [default: {DEFAULT_SERVER}]{'; --local needs none' if or_local else ''}",
     )
-    local = click.option(
-        "--local", is_flag=True, **kept(LOCAL), help="Run in this process, without a service"
-    )
+    local = kept(LOCAL)("--local", is_flag=True, help="Run in this process, without a service")
     return lambda command: server(key(local(command) if or_local else command))
 
 
@@ -109,8 +105,8 @@ _ADDRESS = "Address of the service, which this command needs"
 SERVER, SERVER_OR_LOCAL = server_option(_ADDRESS), server_option(_ADDRESS, or_local=True)
 SERVER_FOR_IDS = server_option("Address of the service, which is needed only if a PSF is given by its id")
 PSF = psf_option(
-    "PSF: an id or a file; an instrument (aia_171, FILE.toml); or a published PSF (aia_171_2025) [default: the "
-    "certified PSF for the image, else the one built]",
+    "PSF: an id or a file; an instrument (aia_171, FILE.toml); or a published PSF (aia_171_2025; published: that "
+    "of the first image) [default: the certified PSF for the image, else the one built]",
     or_instrument=True,
 )
 CONTEXT = options_of(Deconvolve, "context")
@@ -145,7 +141,7 @@ def on_service(command: Command) -> Command:
 
     @SERVER
     @wraps(command)
-    def connected(**given: Any) -> Any:
+    def connected(**given: object) -> object:
         with remote() as service:
             return command(service=service, **given)
 
@@ -201,12 +197,20 @@ def psf_file(psf: str) -> Iterator[Path]:
         yield file
 
 
-def named_psf(service: Operations, psf: str | None) -> str | None:
+def named_psf(service: Operations, psf: str | None, *, image: Path | None = None) -> str | None:
     """The id of the PSF that the user named with ``--psf``; a file is uploaded first, the PSF of an instrument is
     built, and a published PSF is uploaded if the service has none of this name.
+
+    image: the first image of the command, whose published PSF "published" means; None: the command has no image.
     """
     if psf is None:
         return None
+    if psf == PUBLISHED_OF_IMAGE and is_psf_id(psf):
+        assert image is not None  # the option of commands without images does not accept this name
+        from psfcore.fits.blocks import LIMITS
+        from psfcore.fits.header import read_summary
+
+        psf = published_of(read_summary(image, LIMITS).cards).name
     if psf.endswith(".toml") or (psf in instrument_names() and is_psf_id(psf)):
         return service.psf_of_instrument(psf)
     if psf in PUBLISHED and is_psf_id(psf):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 import click
 
@@ -35,7 +35,7 @@ def convolve(
     edges: KnownScene,
     plot: Path | None,
     overwrite: bool,
-    **parameters: Any,
+    **parameters: object,
 ) -> None:
     """Convolve IMAGE (FITS), a model of the Sun, with a PSF: what the telescope would record.
 
@@ -47,7 +47,7 @@ def convolve(
     psf_files = [Path(psf)] if psf and Path(psf).is_file() else []
     check_outputs((output, plot), inputs=[image, *psf_files], overwrite=overwrite)
     with local() as here, progress_bar() as report:
-        parameters |= {"psf_id": named_psf(here, psf)}
+        parameters |= {"psf_id": named_psf(here, psf, image=image)}
         found, used = here.convolve(str(here.upload_image(image)["id"]), edges, report, **parameters)
         with written(output, overwrite=overwrite) as file:
             write(found, file, used)

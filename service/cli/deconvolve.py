@@ -5,7 +5,7 @@ which deconvolves several images and shows what changed, with the highest artefa
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -79,7 +79,7 @@ def deconvolve(
     changes: Path | None,
     timings: bool,
     overwrite: bool,
-    **parameters: Any,
+    **parameters: object,
 ) -> None:
     """Deconvolve IMAGES (FITS files, or folders of them) with the PSF of their instrument, or with yours.
 
@@ -105,12 +105,12 @@ def deconvolve(
         connection() as service,
         progress_bar() as report,
     ):
-        parameters |= {"psf_id": named_psf(service, psf), "overwrite": overwrite}
+        parameters |= {"psf_id": named_psf(service, psf, image=files[0])}
         if not into_folder:
-            lines = _one(service, files[0], output.path, plot, changes, report, parameters)
+            lines = _one(service, files[0], output.path, plot, changes, report, parameters, overwrite)
             failures: list[Outcome] = []
         else:
-            lines, failures = _many(service, files, output.path, report, parameters)
+            lines, failures = _many(service, files, output.path, report, parameters, overwrite)
         if timings:
             lines += _timings(service)
     echo("\n".join(lines))
@@ -148,10 +148,13 @@ def _one(
     plot: Path | None,
     changes: Path | None,
     report: Report,
-    parameters: dict[str, Any],
+    parameters: Mapping[str, object],
+    overwrite: bool,
 ) -> list[str]:
     """Deconvolve one image into a file; returns the lines to print."""
-    product = service.deconvolve(image, output, preview=plot, changes=changes, progress=report, **parameters)
+    product = service.deconvolve(
+        image, output, preview=plot, changes=changes, progress=report, overwrite=overwrite, **parameters
+    )
     say_warnings(product)
     first, *others = summary_lines(product["details"])
     pictures = [str(path) for path in (plot, changes) if path is not None]
@@ -164,12 +167,22 @@ def _one(
 
 
 def _many(
-    service: Operations, files: list[Path], folder: Path, report: Report, parameters: dict[str, Any]
+    service: Operations,
+    files: list[Path],
+    folder: Path,
+    report: Report,
+    parameters: Mapping[str, object],
+    overwrite: bool,
 ) -> tuple[list[str], list[Outcome]]:
     """Deconvolve images into a folder; returns the lines to print, and the failures."""
     outcomes = list(
         deconvolve_many(
-            service, files, folder, progress=lambda done, of: report("images", done, of), **parameters
+            service,
+            files,
+            folder,
+            progress=lambda done, of: report("images", done, of),
+            overwrite=overwrite,
+            **parameters,
         )
     )
     for one in outcomes:
@@ -203,7 +216,7 @@ def changes(
     psf: str | None,
     most: int,
     overwrite: bool,
-    **parameters: Any,
+    **parameters: object,
 ) -> None:
     """Deconvolve IMAGES (FITS files, or folders of them); write a table of what changed and a contact sheet.
 
@@ -219,7 +232,7 @@ def changes(
         psf_file = psf if psf and Path(psf).is_file() else None
         check_outputs((table_file, sheet_file), inputs=(*files, psf_file), overwrite=overwrite)
     with connection() as service, progress_bar() as report:
-        parameters["psf_id"] = named_psf(service, psf)
+        parameters["psf_id"] = named_psf(service, psf, image=Path(files[0]))
         products: dict[str, dict[str, str]] = {}
         treated, failures = treat_many(
             files,

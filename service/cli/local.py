@@ -41,6 +41,7 @@ from service.client.answers import Ended, Json, Submitted, Uploaded
 from service.client.errors import ServiceError
 from service.client.operations import Operations, Progress, named_instrument
 from service.client.outputs import written
+from workers.contract.documents import header_json
 from workers.contract.identities import (
     build_for,
     check_noise,
@@ -286,7 +287,7 @@ class Local(Operations):
         psf: dict[str, object] = {"psf_id": request.psf_id}
         if request.psf_id is None:
             if summary.instrument is None:
-                raise unknown_instrument(asdict(summary))
+                raise unknown_instrument(header_json(asdict(summary)))
             recipe = build_for(summary.instrument, frame_of(summary.cards).turn_to_build_deg)
             psf = {"psf_id": psf_identity(recipe), "psf_recipe": recipe}
         elif request.psf_id not in self.inputs.psfs | self.inputs.builds:

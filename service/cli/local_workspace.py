@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from psfcore.deconvolve.conditions import PreparedPsfs
 from psfcore.deconvolve.run import BUILDING, PsfSource, UsedPsf
@@ -23,6 +23,7 @@ from psfcore.instruments.unknown import channel_of
 from psfcore.psf import Psf
 from psfcore.psf_cache import built_file, kept_psf
 from psfcore.transit.archive import ArchiveContents, unpack
+from workers.contract.documents import header_json
 from workers.contract.identities import instrument_of_build, recipe_of
 from workers.contract.kinds import ResultType
 from workers.contract.requests import Deconvolve, PsfBuild, ResolvedDeconvolve
@@ -35,6 +36,7 @@ from workers.tasks.workspace import Progress, Result, Workspace
 from workers.versions import PsfStatus, instrument_of
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
 
     from psfcore.recipe import Recipe
@@ -78,7 +80,7 @@ class PsfFile(ImageFile):
 
     def seen_as(self, psf: Psf) -> Psf:
         """The PSF with the name, the instrument and the wavelength that an upload would get from the header."""
-        instrument = psf.instrument or instrument_of(asdict(self.summary))
+        instrument = psf.instrument or instrument_of(header_json(asdict(self.summary)))
         channel = channel_of(instrument, self.summary.wavelnth) or ""
         angstrom = psf.wavelength_angstrom
         if angstrom is None and channel.isdecimal():
@@ -209,7 +211,7 @@ class LocalWorkspace(Workspace):
         return self._kept(recipe_of(build), partial(self.report, BUILDING))
 
     def build(
-        self, recipe: Recipe, mount_image: NDArray[Any] | None, progress: Callable[[int, int], None]
+        self, recipe: Recipe, mount_image: NDArray[np.floating] | None, progress: Callable[[int, int], None]
     ) -> tuple[Psf, Callable[[Path], object]]:
         copy = self.settings.data_dir / f"{recipe.identity}.fits"
         with built_file(
@@ -218,8 +220,10 @@ class LocalWorkspace(Workspace):
             shutil.copyfile(file, copy)
         return read_psf(copy, LIMITS), partial(shutil.copyfile, copy)
 
-    def _kept(self, recipe: Recipe, progress: Callable[[int, int], None] | None = None, **how: Any) -> Psf:
-        return kept_psf(psf_cache(), recipe, LIMITS, threads=self.threads, progress=progress, **how)
+    def _kept(
+        self, recipe: Recipe, progress: Callable[[int, int], None] | None = None, *, parts: bool = True
+    ) -> Psf:
+        return kept_psf(psf_cache(), recipe, LIMITS, threads=self.threads, progress=progress, parts=parts)
 
     @contextmanager
     def unpacked(self, transit_id: str) -> Iterator[Path]:

@@ -81,7 +81,7 @@ class LazyGroup(click.Group):
             ctx.fail(f"there is no command '{name}'.{hint}")
         return super().resolve_command(ctx, args)
 
-    def invoke(self, ctx: click.Context) -> Any:
+    def invoke(self, ctx: click.Context) -> object:
         """Run a command. Control-C ends it with status 130; if its job continues, a message says how to return to the
         job.
 

@@ -8,7 +8,6 @@ import shutil
 import time
 from functools import wraps
 from pathlib import Path
-from typing import Any
 
 import click
 from sqlalchemy import make_url
@@ -76,7 +75,7 @@ def on_catalogue(command: Command) -> Command:
 
     @DATA
     @wraps(command)
-    def opened(data: Path | None, **given: Any) -> None:
+    def opened(data: Path | None, **given: object) -> None:
         settings = read_settings(data)
         keep_private()
         if settings.database_url is None:

@@ -14,7 +14,7 @@ import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import wraps
+from functools import partial, wraps
 from importlib.util import find_spec
 from pathlib import Path
 from types import NoneType, UnionType
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from service.client.answers import Product
     from workers.settings import Settings
 
-Command = TypeVar("Command", bound=Callable[..., Any])
+Command = TypeVar("Command", bound=Callable[..., object])
 _NULL = re.compile(r"; null: (.*?)(?=\. |$)")
 _QUOTED = re.compile(r"`([^`]*)`")
 _FALSE = re.compile(r"; false: .*$")
@@ -112,7 +112,7 @@ def _name(model: type[BaseModel], name: str) -> str:
     return _about(_field(model, name)).name or f"--{name.replace('_', '-')}"
 
 
-def _kind(field: FieldInfo) -> Any:
+def _kind(field: FieldInfo) -> object:
     """The type of a value that is given."""
     kind = field.annotation
     if get_origin(kind) in (Union, UnionType):
@@ -120,7 +120,7 @@ def _kind(field: FieldInfo) -> Any:
     return get_args(kind)[0] if get_origin(kind) is Annotated else kind
 
 
-def _type(kind: Any, field: FieldInfo) -> click.ParamType:
+def _type(kind: object, field: FieldInfo) -> click.ParamType:
     if get_origin(kind) is Literal:
         return click.Choice([str(one) for one in get_args(kind)])
     if kind not in (int, float):
@@ -149,7 +149,7 @@ class Text(click.ParamType):
     def __init__(self, read: Callable[[str], object], *, name: str = "text", keep: bool = False) -> None:
         self.read, self.name, self.keep = read, name, keep
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> object:
         """The value of a text."""
         try:
             read = self.read(str(value))
@@ -174,7 +174,9 @@ def _help(model: type[BaseModel], field: FieldInfo) -> str:
 
 
 class _Output(click.Path):
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+    def convert(
+        self, value: str | os.PathLike[str], param: click.Parameter | None, ctx: click.Context | None
+    ) -> str | bytes | os.PathLike[str]:
         """The path. "-" is refused: it means standard output in many programs, but commands write messages there."""
         if str(value) == "-":
             message = (
@@ -192,7 +194,9 @@ class OutputFile(_Output):
 class DrawnFile(OutputFile):
     """The type of an option that names a picture or page to write. A missing package is told before the work begins."""
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+    def convert(
+        self, value: str | os.PathLike[str], param: click.Parameter | None, ctx: click.Context | None
+    ) -> str | bytes | os.PathLike[str]:
         """The path. Raises MissingExtra."""
         for package in ("matplotlib", "jinja2"):
             if find_spec(package) is None:
@@ -208,11 +212,11 @@ class OutputPlace(OutputFile):
     """The type of an option that names a file to write, or a folder in which the command chooses the file name."""
 
     def convert(  # type: ignore[override]  # more than a path
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+        self, value: str | os.PathLike[str], param: click.Parameter | None, ctx: click.Context | None
     ) -> OutputPath:
         """The path, and whether it is a folder: a folder of this name exists, or the text ends in a slash."""
-        path = super().convert(value, param, ctx)
-        return OutputPath(Path(path), is_folder=str(value).endswith(("/", os.sep)) or Path(path).is_dir())
+        path = Path(os.fsdecode(super().convert(value, param, ctx)))
+        return OutputPath(path, is_folder=str(value).endswith(("/", os.sep)) or path.is_dir())
 
 
 @dataclass(frozen=True)
@@ -269,14 +273,13 @@ OVERWRITE = click.option("--overwrite", is_flag=True, help="Replace output files
 LOCAL = "heliopsf.local"
 
 
-def kept(name: str) -> dict[str, Any]:
-    """The arguments of an option whose value goes to the context of the command, under this name, and not to the
-    command.
-    """
-    return {
-        "expose_value": False,
-        "callback": lambda context, _, value: context.meta.update({name: value}),
-    }
+def kept(name: str) -> Callable[..., Callable[[Command], Command]]:
+    """An option whose value goes to the context of the command, under this name, and not to the command."""
+    return partial(
+        click.option,
+        expose_value=False,
+        callback=lambda context, _, value: context.meta.update({name: value}),
+    )
 
 
 def is_local() -> bool:
@@ -300,7 +303,7 @@ def writes_files(command: Command) -> Command:
 
     @OVERWRITE
     @wraps(command)
-    def checked(**given: Any) -> Any:
+    def checked(**given: object) -> object:
         _check_files(click.get_current_context().command.params, given)
         return command(**given)
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import click
 
@@ -216,12 +215,15 @@ def flare(
     image: Path,
     background: Path,
     psf: str,
+    *,
+    centre_xy: tuple[float, float] | None,
+    arm_deg: float | None,
+    distances_px: tuple[float, float],
     noise: tuple[float, float] | None,
     saturation_dn: float | None,
     json_file: Path | None,
     plot: Path | None,
     overwrite: bool,
-    **along: Any,
 ) -> None:
     """Simulate the stray light of the flare in IMAGE with a PSF, and compare it along a diffraction arm."""
     from psfcore.fits.observation import read_observation
@@ -236,7 +238,9 @@ def flare(
         read_observation(image, limits(), saturation_dn=saturation_dn),
         read_observation(background, limits(), saturation_dn=saturation_dn),
         tested,
-        **along,
+        centre_xy=centre_xy,
+        arm_deg=arm_deg,
+        distances_px=distances_px,
         noise=None if noise is None else Noise(*noise),
     )
     draw = partial(flare_png, found.difference, found.usable, found.comparison, unit=found.unit)

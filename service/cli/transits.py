@@ -84,7 +84,7 @@ def report(
     json_file: Path | None,
     plot: Path | None,
     psf: str | None,
-    **parameters: Any,
+    **parameters: object,
 ) -> None:
     """Fit a PSF to TRANSIT, or test a PSF on it: compare simulated and observed light in the occulter's disc.
 
@@ -176,7 +176,7 @@ def diagnose(
     corrected_file: Path | None,
     effects: str | None,
     overwrite: bool,
-    **parameters: Any,
+    **parameters: object,
 ) -> None:
     """Diagnose the gap between TRANSIT and the model fitted to it: which effect explains the residuals.
 

@@ -14,7 +14,7 @@ from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self, cast
+from typing import Self, TypedDict, Unpack, cast
 
 import httpx
 
@@ -42,7 +42,18 @@ TUS = {"Tus-Resumable": "1.0.0"}
 # request sends bytes (423), or the offset was another one (409).
 AGAIN = (*PASSING, 409, 423, 460)
 Ask = Callable[..., httpx.Response]
+Parameter = str | int | float | bool | None
+Parameters = Mapping[str, Parameter | Sequence[Parameter]]
 _STANDARD_FIELDS = ("type", "title", "status", "detail", "instance")  # of a problem document, RFC 9457
+
+
+class RequestOptions(TypedDict, total=False):
+    """What a request has besides its address and its parameters, as httpx takes them; timeout in s."""
+
+    json: object
+    content: bytes | Iterator[bytes]
+    headers: Mapping[str, str]
+    timeout: float
 
 
 class Connection:
@@ -239,7 +250,9 @@ class Connection:
             for event in events:
                 yield event["event"], json.loads(event["data"])
 
-    def _events(self, address: str, **options: Any) -> Generator[dict[str, str], None, None]:
+    def _events(
+        self, address: str, params: Parameters | None = None
+    ) -> Generator[dict[str, str], None, None]:
         """The events of a stream. If the connection is lost, the stream is opened again. The iteration ends if the
         service answers 204 (no more events).
         """
@@ -248,7 +261,7 @@ class Connection:
         while True:
             headers = {} if last_id is None else {"Last-Event-ID": last_id}
             try:
-                with self._streamed(address, headers=headers, timeout=QUIET_S, **options) as answer:
+                with self._streamed(address, params, headers=headers, timeout=QUIET_S) as answer:
                     for event in _events_in(answer.iter_lines()):
                         patience.answered()
                         last_id = event.get("id", last_id)
@@ -261,7 +274,7 @@ class Connection:
             else:
                 time.sleep(FIRST_WAIT_S)
 
-    def _all(self, kind: type[AnyAnswer], address: str, filters: Mapping[str, object]) -> Iterator[AnyAnswer]:
+    def _all(self, kind: type[AnyAnswer], address: str, filters: Parameters) -> Iterator[AnyAnswer]:
         """All items of a list."""
         page = self._json(dict[str, Json], "GET", address, params={"limit": "200", **filters})
         while True:
@@ -270,22 +283,37 @@ class Connection:
                 return
             page = self.get(str(page["next"]))
 
-    def _json(self, _kind: type[AnyAnswer], method: str, address: str, **options: Any) -> AnyAnswer:
+    def _json(
+        self,
+        _kind: type[AnyAnswer],
+        method: str,
+        address: str,
+        *,
+        params: Parameters | None = None,
+        **options: Unpack[RequestOptions],
+    ) -> AnyAnswer:
         """The JSON that a request answers. _kind: its form."""
-        body: AnyAnswer = self._answer(method, address, **options).json()
+        body: AnyAnswer = self._answer(method, address, params=params, **options).json()
         return body
 
     def _answer(
-        self, method: str, address: str, *, params: Mapping[str, Any] | None = None, **options: Any
+        self,
+        method: str,
+        address: str,
+        *,
+        params: Parameters | None = None,
+        **options: Unpack[RequestOptions],
     ) -> httpx.Response:
         """The answer to a request. A parameter whose value is None is not sent."""
         with self._reached():
             return self._http.request(method, address, params=without_none(params or {}) or None, **options)
 
     @contextmanager
-    def _streamed(self, address: str, **options: Any) -> Iterator[httpx.Response]:
+    def _streamed(
+        self, address: str, params: Parameters | None = None, **options: Unpack[RequestOptions]
+    ) -> Iterator[httpx.Response]:
         """The answer at an address, read while it arrives."""
-        with self._reached(), self._http.stream("GET", address, **options) as response:
+        with self._reached(), self._http.stream("GET", address, params=params, **options) as response:
             yield response
 
     @contextmanager
@@ -375,7 +403,7 @@ def upload_in_parts(ask: Ask, path: Path, kind: str, filename: str, say: Callabl
                 patience.wait(error, passing)
 
 
-def _part(content: bytes, offset: int) -> dict[str, Any]:
+def _part(content: bytes, offset: int) -> RequestOptions:
     """The body and the headers of a request that sends the bytes from an offset on."""
     checksum = base64.b64encode(hashlib.sha256(content).digest()).decode()
     headers = {

@@ -34,7 +34,7 @@ class ServiceError(Exception):
         The reason as a word in kebab-case for programs, such as "no-such-psf". None: heliopsf did not answer.
     retry_after_s : float, optional
         Time after which the service asks to try again, s.
-    fields : mapping of str to Any, optional
+    fields : mapping of str to object, optional
         Further fields of the problem document, such as ``psfs`` of "no-psf-for-instrument".
     """
 
@@ -45,7 +45,7 @@ class ServiceError(Exception):
         status: int | None = None,
         code: str | None = None,
         retry_after_s: float | None = None,
-        fields: Mapping[str, Any] | None = None,
+        fields: Mapping[str, object] | None = None,
     ) -> None:
         super().__init__(message)
         self.status, self.code, self.retry_after_s = status, code, retry_after_s

@@ -50,7 +50,13 @@ from service.client.answers import (
     Transit,
     Uploaded,
 )
-from service.client.connection import FROM_BYTES, GOES_ON, Connection, upload_in_parts
+from service.client.connection import (
+    FROM_BYTES,
+    GOES_ON,
+    Connection,
+    Parameters,
+    upload_in_parts,
+)
 from service.client.errors import SHOWN_DIGITS, Patience, ServiceError, WaitInterrupted
 from service.client.operations import Operations, Progress, without_none
 
@@ -160,7 +166,7 @@ class Client(Connection, Operations):
         kind: type[AnyAnswer],
         address: str,
         path: Path,
-        query: Mapping[str, object] | None = None,
+        query: Parameters | None = None,
         *,
         media_type: str = "application/fits",
     ) -> AnyAnswer:
@@ -745,7 +751,9 @@ class Client(Connection, Operations):
         """
         return cast("ComparisonAnswer", self.answer([psf_id, other_id], f"compare/{other_id}", {}))
 
-    def answer(self, psf_ids: list[str], question: str, query: Mapping[str, object]) -> dict[str, Json]:
+    def answer(
+        self, psf_ids: list[str], question: str, query: Mapping[str, float | list[float]]
+    ) -> dict[str, Json]:
         """Get the answer to a question on PSFs. If tables are missing, they are made first.
 
         Parameters
@@ -1388,8 +1396,8 @@ class Client(Connection, Operations):
         ServiceError
             "no-such-bulk".
         """
-        query = without_none({"order": order, "limit": limit})
-        with self._streamed(f"/v1/bulk/{bulk_id}/results", params=query) as answer:
+        query: Parameters = without_none({"order": order, "limit": limit})
+        with self._streamed(f"/v1/bulk/{bulk_id}/results", query) as answer:
             for line in answer.iter_lines():
                 yield json.loads(line)
 

@@ -283,7 +283,7 @@ class KeyFirst(APIRoute):
         return answer
 
 
-def _scopes_of(endpoint: Callable[..., Any]) -> list[str]:
+def _scopes_of(endpoint: Callable[..., object]) -> list[str]:
     """The scopes that an endpoint requires, read from the annotation of its parameter for the caller."""
     for annotation in get_type_hints(endpoint, include_extras=True).values():
         for mark in getattr(annotation, "__metadata__", ()):

@@ -76,8 +76,16 @@ def send(
 class _Stored(FileResponse):
     """An answer with a stored file, which is fetched when it is the turn of the owner. The storage may be slow."""
 
-    def __init__(self, request: Request, find: Callable[[], Path], **options: Any) -> None:
-        super().__init__("", **options)
+    def __init__(
+        self,
+        request: Request,
+        find: Callable[[], Path],
+        *,
+        media_type: str,
+        filename: str | None,
+        headers: dict[str, str],
+    ) -> None:
+        super().__init__("", media_type=media_type, filename=filename, headers=headers)
         self._request, self._find = request, find
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -129,7 +137,7 @@ def _logged(error: BadFile) -> Problem:
 # --- uploads --------------------------------------------------------------------------------------------
 
 
-def _body(what: str, media_type: str) -> dict[str, Any]:
+def _body(what: str, media_type: str) -> dict[str, object]:
     """The OpenAPI description of an upload."""
     return {
         "parameters": [
@@ -177,7 +185,7 @@ class UploadKind(Generic[Row]):
     table: type[Row]
     start_bytes: int
     may_start: Callable[[bytes, bool], bool]
-    content: Callable[[Path, State], Any]
+    content: Callable[[Path, State], object]
     row: Callable[..., Row]
     limit: str = "max_upload_bytes"  # the setting
 
@@ -198,7 +206,7 @@ class UploadKind(Generic[Row]):
         if size_bytes == 0:
             raise Problem(400, "empty-upload", f"expected {self.what}; got 0 bytes: check the file")
 
-    def inspect(self, path: Path, state: State) -> Any:
+    def inspect(self, path: Path, state: State) -> object:
         """The summary of a received file. Raises ``Problem`` 413, 415 or 422 if the file cannot be used."""
         with path.open("rb") as file:
             self.check_start(file.read(self.start_bytes), whole=True)
@@ -316,11 +324,13 @@ def _advising(request: Request) -> Iterator[None]:
             f"the body was sent as {URL_ENCODED}, as curl -d does, which removes zeros and line ends from a file: "
             "send it with curl -F file=@FILE or curl --data-binary @FILE"
         )
-        raise Problem(error.status, error.code, f"{error.detail}; {advice}", **error.more) from error
+        raise Problem(
+            error.status, error.code, f"{error.detail}; {advice}", headers=None, **error.more
+        ) from error
 
 
 async def _receive(
-    request: Request, path: Path, state: State, kind: UploadKind[Any], take: Allowed
+    request: Request, path: Path, state: State, kind: UploadKind[Row], take: Allowed
 ) -> RequestFile:
     """Write the file of a request to a path."""
     most_bytes = kind.most_bytes(state)

@@ -23,7 +23,7 @@ import anyio.to_thread
 
 P = ParamSpec("P")
 T = TypeVar("T")
-Endpoint = TypeVar("Endpoint", bound=Callable[..., Any])
+Endpoint = TypeVar("Endpoint", bound=Callable[..., object])
 
 
 @dataclass
@@ -89,7 +89,7 @@ class Gate:
             queue.waiting.popleft().set()
 
 
-def in_turn(register: Callable[[Callable[..., Any]], object]) -> Callable[[Endpoint], Endpoint]:
+def in_turn(register: Callable[[Callable[..., object]], object]) -> Callable[[Endpoint], Endpoint]:
     """Register an endpoint that calls the store, such as ``@in_turn(router.get("/{psf_id}"))``: it runs behind the gate
     ``stored``.
 
@@ -98,7 +98,7 @@ def in_turn(register: Callable[[Callable[..., Any]], object]) -> Callable[[Endpo
 
     def decorate(endpoint: Endpoint) -> Endpoint:
         @wraps(endpoint)
-        async def run(**given: Any) -> Any:
+        async def run(**given: Any) -> object:
             return await given["state"].stored.run(given["caller"].owner, endpoint, **given)
 
         register(run)

@@ -24,7 +24,6 @@ import re
 from collections.abc import Iterator
 from contextlib import ExitStack
 from functools import partial
-from typing import Any
 from urllib.parse import unquote, urlsplit
 
 from fastapi import FastAPI, Request
@@ -301,7 +300,7 @@ class JsonRequest(Request):
     not wait.
     """
 
-    async def json(self) -> Any:
+    async def json(self) -> object:
         """The content of the body. Raises ``Problem`` 413 for too many values, ``Problem`` 422 as ``check_text``, and
         ValueError if it is not JSON.
         """
@@ -315,7 +314,7 @@ class JsonRequest(Request):
                     "less in one request",
                 )
 
-        def parsed() -> Any:
+        def parsed() -> object:
             value = json.loads(content)
             check_text(*_texts_in(value))
             return value

@@ -170,7 +170,7 @@ class Lookout:
         owner: str,
         kinds: Sequence[StreamKind[Any]],
         clock: Callable[[], float],
-        let_in: Callable[[Any], bool],
+        let_in: Callable[[Hashable], bool],
     ) -> None:
         """clock: the time of the database. let_in: whether the key of a caller is still valid."""
         self._owner, self._kinds, self._clock, self._let_in = owner, kinds, clock, let_in
@@ -253,7 +253,7 @@ class Lookout:
             pages.append(page[-1] if len(page) == MOST else again_from)
             found = [*page, *(kind.changes.open(self._owner) if begin else ())]
             changed |= {(kind.name, one): version(at) for at, one in found}
-            rest = _ids(known, kind).difference(one for _, one in found)
+            rest = _ids(known, kind.name).difference(one for _, one in found)
             others |= {(kind.name, one): version(at) for at, one in kind.changes.among(self._owner, rest)}
         versions = changed | others
         unknown = {key for one in followers for key in one.news(versions, changed)}
@@ -262,13 +262,13 @@ class Lookout:
                 version(row.changed_at), row.ended_at is not None, kind.view(row).model_dump_json()
             )
             for kind in self._kinds
-            for row in kind.changes.rows(_ids(unknown & versions.keys(), kind))
+            for row in kind.changes.rows(_ids(unknown & versions.keys(), kind.name))
         }
         return Sight(pages, changed, versions, states)
 
 
-def _ids(keys: Iterable[Key], kind: StreamKind[Any]) -> set[str]:
-    return {identity for name, identity in keys if name == kind.name}
+def _ids(keys: Iterable[Key], kind: str) -> set[str]:
+    return {identity for name, identity in keys if name == kind}
 
 
 def _away(error: SQLAlchemyError) -> None:

@@ -7,7 +7,7 @@ import binascii
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Generic, TypeVar
+from typing import Annotated, Any, Generic, TypedDict, TypeVar
 
 from fastapi import Depends, Query, Request
 from pydantic import BaseModel, Field
@@ -73,6 +73,13 @@ def _place_in_time(row: Any) -> tuple[str, ...]:
     return repr(row.created_at), row.id
 
 
+class RowsQuery(TypedDict):
+    """Arguments of the query for the rows of a page."""
+
+    limit: int
+    after: tuple[float, str] | None
+
+
 @dataclass(frozen=True)
 class Listing:
     """The page of a list that a request asks for."""
@@ -82,7 +89,7 @@ class Listing:
     cursor: str | None = None
 
     @property
-    def query(self) -> dict[str, Any]:
+    def query(self) -> RowsQuery:
         """Arguments of the query for the rows: one more than the page has, which shows that there is a next page, after
         the (created_at, id) in the cursor. Raises ``Problem`` 422 if this service did not issue the cursor.
         """

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from http import HTTPStatus
-from typing import Any, cast
+from typing import TypedDict, cast
 
 from fastapi import FastAPI, Request
 from fastapi.concurrency import run_in_threadpool
@@ -111,15 +111,17 @@ class Problem(HTTPException):
     """
 
     def __init__(
-        self, status: int, code: str, detail: str, *, headers: Mapping[str, str] | None = None, **more: Any
+        self, status: int, code: str, detail: str, *, headers: Mapping[str, str] | None = None, **more: object
     ) -> None:
         super().__init__(status, detail, dict(headers or {}))
         self.status, self.code, self.more = status, code, more
 
 
-def problem(error: DataError, **more: Any) -> Problem:
+def problem(error: DataError, **more: object) -> Problem:
     """The HTTP error for a DataError, with the same code, message and fields. more: fields to add."""
-    return Problem(STATUS_OF.get(error.code, 422), error.code, error.message, **{**error.fields, **more})
+    return Problem(
+        STATUS_OF.get(error.code, 422), error.code, error.message, headers=None, **{**error.fields, **more}
+    )
 
 
 @contextmanager
@@ -131,10 +133,22 @@ def as_problems() -> Iterator[None]:
         raise problem(error) from error
 
 
-RESPONSES: dict[int | str, dict[str, Any]] = {
+Descriptions = dict[int | str, dict[str, object]]  # of answers, for OpenAPI, by status
+
+
+class RouteOptions(TypedDict, total=False):
+    """What several routes state in the same way."""
+
+    status_code: int
+    response_class: type[Response]
+    responses: Descriptions
+    openapi_extra: dict[str, object]
+
+
+RESPONSES: Descriptions = {
     "4XX": {"model": ProblemDocument, "description": "The request was refused; `detail` says why."},
 }
-AsPage = Callable[[Request, int, str, str, Mapping[str, Any]], Response]
+AsPage = Callable[[Request, int, str, str, Mapping[str, object]], Response]
 
 
 def answer(request: Request, error: Problem, as_page: AsPage) -> Response:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from service.http.callers import Caller
 from service.http.problems import Problem
@@ -106,6 +105,8 @@ def _file_too_large(usage: Usage, count: int) -> Problem:
     return _exceeded(413, usage, message, needed_bytes=count)
 
 
-def _exceeded(status: int, usage: Usage, message: str, **more: Any) -> Problem:
+def _exceeded(status: int, usage: Usage, message: str, **more: object) -> Problem:
     used, limit = usage.used_bytes, usage.limit_bytes
-    return Problem(status, "quota-exceeded", message, used_bytes=used, limit_bytes=limit, **more)
+    return Problem(
+        status, "quota-exceeded", message, headers=None, used_bytes=used, limit_bytes=limit, **more
+    )

@@ -15,7 +15,6 @@ import time
 from collections import Counter
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
 from weakref import WeakValueDictionary
 
 from limits import RateLimitItem, RateLimitItemPerMinute
@@ -113,10 +112,12 @@ class Rates:
 
     def _limit_by(self) -> SlidingWindowCounterRateLimiter:
         if self._limiter is None:
-            storage: Any = MemoryStorage()
-            if self._url is not None:
-                patience = {"socket_connect_timeout": _PATIENCE_S, "socket_timeout": _PATIENCE_S}
-                storage = storage_from_string(self._url, wrap_exceptions=True, **patience)
+            patience = {"socket_connect_timeout": _PATIENCE_S, "socket_timeout": _PATIENCE_S}
+            storage = (
+                MemoryStorage()
+                if self._url is None
+                else storage_from_string(self._url, wrap_exceptions=True, **patience)
+            )
             self._limiter = SlidingWindowCounterRateLimiter(storage)
         return self._limiter
 

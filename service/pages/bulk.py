@@ -149,7 +149,7 @@ def _form(form: Sent, caller: Caller, state: State) -> dict[str, Any]:
     }
 
 
-def _common_parts(form: Sent) -> dict[str, Any]:
+def _common_parts(form: Sent) -> dict[str, object]:
     """The name, PSF or context (``psf:ID`` or ``context:ID``) and method of a run. Raises ``Problem`` 422."""
     kind, _, identity = text(form, "choice").partition(":")
     if kind not in _PSF_NAMES:
@@ -266,7 +266,7 @@ def change_run(
     return RedirectResponse(f"/bulk/{bulk_id}", 303)
 
 
-def _reasons(bulk_id: str, caller: Caller, state: State) -> list[dict[str, Any]]:
+def _reasons(bulk_id: str, caller: Caller, state: State) -> list[dict[str, object]]:
     """The reasons of failures: the number of images, the code, and an example with its image."""
     found = state.catalogue.bulks.progress.reasons(bulk_id)
     names = _names([reason.example for reason in found], caller, state)
@@ -285,7 +285,7 @@ def _told(failed: BulkItemRow) -> str:
     return of_error(error.get("code", ""), error.get("message", ""))
 
 
-def _cards(rows: Sequence[BulkItemRow], caller: Caller, state: State) -> list[dict[str, Any]]:
+def _cards(rows: Sequence[BulkItemRow], caller: Caller, state: State) -> list[dict[str, object]]:
     """The entries of the images on the contact sheet."""
     results, names = [Result.of(row) for row in rows], _names(rows, caller, state)
     there = state.catalogue.ids_among(ProductRow, [one.product_id for one in results], caller.owner)

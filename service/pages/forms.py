@@ -14,7 +14,7 @@ from fastapi import Depends, Request, Response
 from fastapi.responses import RedirectResponse
 from markupsafe import Markup
 from pydantic import BaseModel, TypeAdapter, ValidationError
-from starlette.datastructures import UploadFile
+from starlette.datastructures import FormData, UploadFile
 
 from service.api.jobs import submit_job
 from service.http.callers import Caller
@@ -29,7 +29,7 @@ Sent = Mapping[str, str | UploadFile]
 Checked = TypeVar("Checked")
 
 
-async def _sent_form(request: Request) -> Sent:
+async def _sent_form(request: Request) -> FormData:
     form = await request.form()
     check_text(*(value for value in form.values() if isinstance(value, str)))
     return form
@@ -37,7 +37,7 @@ async def _sent_form(request: Request) -> Sent:
 
 # The fields of the form of a request. It follows the caller in the parameters of a route, so that nothing is read for
 # strangers.
-SentForm = Annotated[Any, Depends(_sent_form)]
+SentForm = Annotated[FormData, Depends(_sent_form)]
 # The options of a deconvolution in the form and in the address of the page of an image.
 _OPTIONS = ("psf_id", "method", "steps", "error_draws", "photon_gain_dn", "read_noise_dn")
 _BOXES = ("other_channel", "again")
@@ -56,7 +56,7 @@ def filled(form: Sent, *names: str) -> dict[str, str]:
     return {name: text(form, name) for name in names if text(form, name)}
 
 
-def parameters(model: type[BaseModel], form: Sent) -> dict[str, Any]:
+def parameters(model: type[BaseModel], form: Sent) -> dict[str, object]:
     """The parameters of a request in a form, by the names of the fields of its model.
 
     A browser sends no field for an empty box. Therefore a box that the form does not send is false: the form of a
@@ -68,7 +68,7 @@ def parameters(model: type[BaseModel], form: Sent) -> dict[str, Any]:
     return {**filled(form, *others), **{name: bool(text(form, name)) for name in boxes}, **noise}
 
 
-def _noise(form: Sent) -> dict[str, Any]:
+def _noise(form: Sent) -> dict[str, object]:
     """The noise figures of a form; no parameter if both fields are empty. The request itself accepts only numbers."""
     figures = checked(dict[str, float], filled(form, "photon_gain_dn", "read_noise_dn"))
     return {"noise": figures} if figures else {}
@@ -136,7 +136,7 @@ def deconvolution(image_id: str, form: Sent) -> JobRequest:
     return job_request("deconvolve", values)
 
 
-def shown_options(form: Sent) -> dict[str, Any]:
+def shown_options(form: Sent) -> dict[str, object]:
     """The options as the form shows them again."""
     values = {name: text(form, name) for name in (*_OPTIONS, *_BOXES)}
     return values | {"error_draws": values["error_draws"] or "0", "changed": any(values.values())}

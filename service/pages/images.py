@@ -8,9 +8,10 @@ from __future__ import annotations
 import hashlib
 import shutil
 import tempfile
+from collections.abc import Mapping, Sequence
 from importlib.resources import as_file, files
 from pathlib import Path
-from typing import Any
+from typing import cast
 
 from fastapi import APIRouter, Request, Response
 from fastapi.concurrency import run_in_threadpool
@@ -189,7 +190,7 @@ def _psfs(chosen: str, image: ImageRow, caller: Caller, state: State) -> tuple[l
     return fit, [psf for psf in found if psf not in fit]
 
 
-def _checked(image_id: str, asked: Sent, caller: Caller, state: State) -> dict[str, Any]:
+def _checked(image_id: str, asked: Sent, caller: Caller, state: State) -> dict[str, object]:
     """The check of the options. good: whether the job can start. lines: sentences, the most important first. button:
     its text. code: of the problem; empty if there is none.
     """
@@ -199,7 +200,11 @@ def _checked(image_id: str, asked: Sent, caller: Caller, state: State) -> dict[s
         if problem.status not in OF_OPTIONS:
             raise
         advice = (SURE,) if problem.code in TO_ALLOW else ()
-        ways = [plain(one["known"]) for one in problem.more.get("ways", ()) if "known" in one]
+        ways = [
+            plain(one["known"])
+            for one in cast("Sequence[Mapping[str, str]]", problem.more.get("ways", ()))
+            if "known" in one
+        ]
         lines = [of_problem(problem), *ways, *advice]
         return {"good": False, "lines": lines, "button": CHECK, "code": problem.code}
     button = OPEN if found.existing else START
@@ -244,6 +249,8 @@ def product(product_id: Identity, request: Request, caller: PageReading, state: 
     image_lost = None if image is None else _lost(state, image.id, image.bytes)
     deprecated = None if psf is None else deprecation(state.catalogue, psf)
     better = None if deprecated is None else deprecated.redo_with
+    published = row.details["psf"].get("published", [])
+    held = state.catalogue.psfs.page(PsfFilter(name=published[0]), row.owner, limit=1) if published else []
     answer = page(
         request,
         "product.html",
@@ -259,6 +266,8 @@ def product(product_id: Identity, request: Request, caller: PageReading, state: 
             if not deprecated or one["code"] != DEPRECATED_CODE
         ],
         deprecated=deprecated,
+        published=published,
+        redo_published=_again(row, psf_id=held[0].id) if held else None,
         redo=_again(row, psf_id="" if better is None else better.id),
         look_from=LOOK_FROM,
         again=_again(row),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from typing import Any
 
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import RedirectResponse
@@ -89,7 +88,7 @@ def _again(view: JobView) -> str | None:
     return address_of(view.parameters) if view.kind == "deconvolve" and whole else None
 
 
-def job_lines(jobs: Sequence[JobView], caller: Caller, state: State) -> list[dict[str, Any]]:
+def job_lines(jobs: Sequence[JobView], caller: Caller, state: State) -> list[dict[str, object]]:
     """The entries of jobs in a list, with the file name of the image and the error."""
     images = [str(job.parameters.get("image_id")) for job in jobs if job.parameters.get("image_id")]
     names = state.catalogue.bulks.progress.names_of_uploads(images, caller.owner)

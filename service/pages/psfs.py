@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable
-from typing import Annotated, Any, TypeVar, get_args
+from typing import Annotated, TypeVar, get_args
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
@@ -276,9 +276,9 @@ def _rivals(state: State, caller: Caller, view: PsfView) -> list[PsfView]:
 
 def _change(form: FormData) -> StatusChange:
     """The change of status in a form. Raises ``Problem`` 422 for a wrong field."""
-    values: dict[str, Any] = filled(
-        form, "status", "reason", "version", "successor", "instrument", "channel", "kind"
-    )
+    values: dict[str, object] = {
+        **filled(form, "status", "reason", "version", "successor", "instrument", "channel", "kind")
+    }
     if text(form, "with_range"):
         values |= {name: text(form, name) or None for name in ("valid_from", "valid_to")}
     values["supersedes"] = [one for one in form.getlist("supersedes") if isinstance(one, str)]
@@ -322,7 +322,7 @@ def comparison(
     )
 
 
-def _compared(one: lookup.Tables, other: lookup.Tables) -> dict[str, Any]:
+def _compared(one: lookup.Tables, other: lookup.Tables) -> dict[str, object]:
     """The curves of two PSFs at the radii that both have, and their differences. Raises DataError
     "plate-scale-mismatch".
     """

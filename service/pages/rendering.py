@@ -14,7 +14,6 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from functools import cache
 from importlib.resources import files
-from typing import Any
 
 from fastapi import Request, Response
 from fastapi.responses import HTMLResponse
@@ -232,7 +231,7 @@ def differing(one: Mapping[str, object], other: Mapping[str, object]) -> list[tu
 
 
 def problem_page(
-    request: Request, status: int, code: str, detail: str, fields: Mapping[str, Any]
+    request: Request, status: int, code: str, detail: str, fields: Mapping[str, object]
 ) -> Response:
     """The page of an error."""
     usual = "The service failed" if status >= 500 else "The service cannot do that"
@@ -251,9 +250,10 @@ def problem_page(
     )
 
 
-def _told(request: Request, code: str, detail: str, fields: Mapping[str, Any]) -> str:
+def _told(request: Request, code: str, detail: str, fields: Mapping[str, object]) -> str:
     if code == "http-404":
         return f"Nothing is at {request.url.path}. Choose a page above."
-    if any(str(one["at"]).startswith("path/") for one in fields.get("errors", [])):
+    errors = fields.get("errors")
+    if isinstance(errors, list) and any(str(one["at"]).startswith("path/") for one in errors):
         return f"{request.url.path} is not the address of a page. Copy the whole address, or choose a page above."
     return of_error(code, detail, fields)

@@ -25,7 +25,7 @@ _FIELDS = {
     "read_noise_dn": "Read noise (DN)",
 }
 _FIELD = re.compile(r"(?:^|(?<=; ))(?:[a-z0-9_-]+\.)*([a-z_]+): ")
-_NO_FIELDS: Mapping[str, Any] = {}
+_NO_FIELDS: Mapping[str, object] = {}
 # Parts of a message that only a command or a program needs, such as "(--again, in a request again = true)".
 _FOR_PROGRAMS = re.compile(
     r"\s*\((?:--|psf_id\b)[^()]*\)|\s*\([^()]*(?:in a request|on the command line)[^()]*\)"
@@ -37,7 +37,7 @@ def of_problem(problem: Problem) -> str:
     return of_error(problem.code, problem.detail, problem.more)
 
 
-def of_error(code: str, message: str, fields: Mapping[str, Any] = _NO_FIELDS) -> str:
+def of_error(code: str, message: str, fields: Mapping[str, object] = _NO_FIELDS) -> str:
     """The sentence for an error. fields: the fields of its ``DataError``; empty for the stored error of a job."""
     thing = NAMES.get(code.removeprefix("no-such-"))
     if thing is not None and message.startswith("expected the id"):
@@ -64,7 +64,7 @@ def plain(message: str) -> str:
     return text if text.endswith((".", "!", "?")) or not text else f"{text}."
 
 
-def _wrong_fields(message: str, _fields: Mapping[str, Any]) -> str:
+def _wrong_fields(message: str, _fields: Mapping[str, object]) -> str:
     """An error message about one or more fields, as a sentence. Each field name is replaced by its form label."""
     text = message.replace("Value error, ", "").removeprefix("the form: ")
 
@@ -74,7 +74,7 @@ def _wrong_fields(message: str, _fields: Mapping[str, Any]) -> str:
     return plain(_FIELD.sub(label, text))
 
 
-def _no_psf(_message: str, fields: Mapping[str, Any]) -> str:
+def _no_psf(_message: str, fields: Mapping[str, object]) -> str:
     why = f": {fields['reason']}" if fields.get("reason") else ""
     return f"No PSF for {fields['image']} is known here{why}. Upload a PSF here, or fit one to a transit."
 
@@ -83,7 +83,7 @@ def _channel(_message: str, fields: Mapping[str, Any]) -> str:
     return f"PSF {fields['psf']} is not made for this image: {'; '.join(fields['differences'])}. Choose another PSF."
 
 
-def _plate_scale(_message: str, fields: Mapping[str, Any]) -> str:
+def _plate_scale(_message: str, fields: Mapping[str, object]) -> str:
     told = (
         f"The pixels of PSF {fields['psf']} are {fields['psf_arcsec']:g} arcsec wide, those of this image "
         f"{fields['image_arcsec']} arcsec. "
@@ -96,7 +96,7 @@ def _plate_scale(_message: str, fields: Mapping[str, Any]) -> str:
     )
 
 
-_SENTENCES: dict[str, Callable[[str, Mapping[str, Any]], str]] = {
+_SENTENCES: dict[str, Callable[[str, Mapping[str, object]], str]] = {
     "no-psf-for-instrument": _no_psf,
     "channel-mismatch": _channel,
     "plate-scale-mismatch": _plate_scale,

@@ -8,17 +8,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from fastapi import APIRouter, Request, Response
 from pydantic import AnyUrl
 
+from service.http.problems import RouteOptions
 from service.http.state import Shared, state_of
 from service.operation import faults, states
 from service.vo import jobs
 from service.vo.lists import LINKS_STANDARD
 from service.vo.parameters import base_url
 from service.vo.votables import TABLES
+
+if TYPE_CHECKING:
+    from pydantic_xml import BaseXmlModel
 
 MEDIA_TYPE, VERSION = "text/xml", "1.1"
 BASIC = "ivo://ivoa.net/sso#BasicAA"
@@ -62,7 +66,7 @@ OFFERED = (
 )
 
 
-def _document(what: str) -> dict[str, Any]:
+def _document(what: str) -> RouteOptions:
     return {
         "response_class": Response,
         "responses": {200: {"content": {MEDIA_TYPE: {}}, "description": f"A document of VOSI 1.1: {what}"}},
@@ -140,6 +144,6 @@ def get_tables() -> Response:
     return _xml(VOSITableSet(tableset_schema=[TableSchema(schema_name="default", table=tables)]))
 
 
-def _xml(made: Any) -> Response:
+def _xml(made: BaseXmlModel) -> Response:
     content = made.to_xml(skip_empty=True, encoding="UTF-8", xml_declaration=True)
     return Response(content, media_type=MEDIA_TYPE)

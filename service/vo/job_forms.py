@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from contextlib import suppress
-from typing import Any
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails, from_json
@@ -48,7 +47,7 @@ def check(kind: str, given: dict[str, str]) -> None:
 
 def resolved(
     state: State, owner: str, kind: str, given: dict[str, str]
-) -> tuple[dict[str, Any], str, dict[str, Any]]:
+) -> tuple[dict[str, object], str, dict[str, float]]:
     """Resolved parameters of a job, the identity of its result, and its estimate.
 
     Raises ``Problem`` 400 if the parameters are wrong or the job would exceed the limits on memory or time, and 507 if
@@ -58,7 +57,7 @@ def resolved(
     values, errors = _understood(kind, given)
     if errors:
         raise _wrong(kind, errors)
-    asked: Any = REQUESTS[kind].model_validate({"kind": kind, "parameters": values})
+    asked = REQUESTS[kind].model_validate({"kind": kind, "parameters": values})
     try:
         parameters, key = resolve(asked, state.catalogue, owner, added_effects=state.settings.added_effects)
         return parameters, key, estimates.checked(kind, parameters, state.catalogue, owner, state.settings)
@@ -66,7 +65,7 @@ def resolved(
         raise bad(error.message) from error
 
 
-def _understood(kind: str, given: dict[str, str]) -> tuple[dict[str, Any], list[ErrorDetails]]:
+def _understood(kind: str, given: dict[str, str]) -> tuple[dict[str, object], list[ErrorDetails]]:
     """The parameters, and an error for each parameter that the contract does not accept.
 
     Each parameter is a text. If the contract accepts the text as it is (a name, a number, true or false), the text is
@@ -75,14 +74,14 @@ def _understood(kind: str, given: dict[str, str]) -> tuple[dict[str, Any], list[
     for name, text in given.items():
         if NO_XML.search(text):
             raise bad(f"{name}: expected characters that XML can hold, got {shown(text)}")
-    values: dict[str, Any] = dict(given)
+    values: dict[str, object] = dict(given)
     for name in {str(error["loc"][0]) for error in _errors(kind, values) if error["loc"]} & given.keys():
         with suppress(ValueError):
             values[name] = from_json(given[name], allow_inf_nan=False)
     return values, _errors(kind, values)
 
 
-def _errors(kind: str, values: dict[str, Any]) -> list[ErrorDetails]:
+def _errors(kind: str, values: dict[str, object]) -> list[ErrorDetails]:
     try:
         _model(kind).model_validate(values)
     except ValidationError as error:

@@ -9,7 +9,7 @@ one runs. Destroying a job does not delete its result. Errors are plain text.
 from __future__ import annotations
 
 import time
-from typing import Annotated, Any
+from typing import Annotated
 
 import anyio
 from fastapi import APIRouter, Depends, Request, Response
@@ -19,7 +19,7 @@ from fastapi.responses import PlainTextResponse, RedirectResponse
 from service.api.jobs import check_own, find
 from service.http.callers import Caller, Reading, Submitting
 from service.http.forms import URL_ENCODED
-from service.http.problems import Problem, problem
+from service.http.problems import Problem, RouteOptions, problem
 from service.http.state import Shared, State
 from service.views import time_left_s
 from service.vo import job_documents as documents
@@ -51,15 +51,15 @@ FIRST_LOOK_S, LONGEST_LOOK_S = 0.05, 1.0  # a waiting request checks its job at 
 PHASES = frozenset({*Phase, "HELD", "SUSPENDED", "UNKNOWN", "ARCHIVED"})
 
 
-TEXT: dict[str, Any] = {"response_class": PlainTextResponse}
-XML: dict[str, Any] = {
+TEXT: RouteOptions = {"response_class": PlainTextResponse}
+XML: RouteOptions = {
     "response_class": Response,
     "responses": {200: {"content": {documents.MEDIA_TYPE: {}}, "description": "A document of UWS 1.1"}},
 }
-TO_JOB: dict[str, Any] = {"status_code": 303, "response_class": RedirectResponse}
+TO_JOB: RouteOptions = {"status_code": 303, "response_class": RedirectResponse}
 
 
-def _form(**described: str) -> dict[str, Any]:
+def _form(**described: str) -> RouteOptions:
     """A route that reads a form and answers with the address of a job. described: the descriptions of the fields."""
     fields = {name: {"type": "string", "description": text} for name, text in described.items()}
     schema = {"type": "object", "properties": fields, "additionalProperties": {"type": "string"}}
@@ -93,12 +93,14 @@ OwnJob = Annotated[JobRow, Depends(_find_own)]
 @router.get(
     "",
     summary="UWS: the job list",
-    **XML,
-    openapi_extra=query(
-        PHASE="list jobs in this phase; may be repeated",
-        AFTER="list jobs created after this time (ISO 8601, UTC)",
-        LAST=f"list only this number of the newest jobs; at most {MOST_LISTED}, which is also the default",
-    ),
+    **XML
+    | {
+        "openapi_extra": query(
+            PHASE="list jobs in this phase; may be repeated",
+            AFTER="list jobs created after this time (ISO 8601, UTC)",
+            LAST=f"list only this number of the newest jobs; at most {MOST_LISTED}, which is also the default",
+        )
+    },
 )
 def list_uws_jobs(request: Request, caller: Reading, state: Shared) -> Response:
     """Your jobs, newest first. /v1/jobs lists all of them in pages."""
@@ -155,11 +157,13 @@ def create_uws_job(caller: Submitting, form: Form, request: Request, state: Shar
 @router.get(
     "/{job_id}",
     summary="UWS: a job",
-    **XML,
-    openapi_extra=query(
-        WAIT="seconds to wait for a change of the phase; -1: as long as the service allows",
-        PHASE="with WAIT: wait only if the job is in this phase",
-    ),
+    **XML
+    | {
+        "openapi_extra": query(
+            WAIT="seconds to wait for a change of the phase; -1: as long as the service allows",
+            PHASE="with WAIT: wait only if the job is in this phase",
+        )
+    },
 )
 async def get_uws_job(job_id: str, request: Request, caller: Reading, state: Shared) -> Response:
     """Show the job: at once, or with WAIT as soon as its phase changes."""
@@ -287,7 +291,7 @@ def post_uws_parameters(
         )
     form.pop("kind", None)
 
-    def change(given: dict[str, Any]) -> dict[str, Any]:
+    def change(given: dict[str, str]) -> dict[str, str]:
         check(row.kind, given | form)
         return given | form
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Literal
+from typing import TYPE_CHECKING, BinaryIO, Literal
 
 from fastapi import APIRouter, Request, Response
 from fastapi.concurrency import run_in_threadpool
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 MOST_IDS = 200
 CUTOUT = "cutout"
 PNG, JSON, PROVN = "image/png", "application/json", "text/provenance-notation"
-Link = dict[str, Any]
+Link = dict[str, object]
 # This number is part of every ETag. Increase it when a new version of the code gives another answer for the same file.
 ANSWERS_VERSION = 1
 Frame = Literal["pixel", "helioprojective"]
@@ -194,7 +194,7 @@ def _link(
 
 def _fault(name: str | None, message: str, semantics: str = "#this", local: str | None = None) -> Link:
     """A row that says why there is no link."""
-    fault = {"error_message": message, "semantics": semantics, "local_semantics": local}
+    fault: Link = {"error_message": message, "semantics": semantics, "local_semantics": local}
     return fault if name is None else {"ID": name, **fault}
 
 

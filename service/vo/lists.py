@@ -21,8 +21,8 @@ from psfcore.errors import DataError
 from psfcore.fits.frame import plate_scale_arcsec
 from psfcore.instruments.psf_statements import title
 from service.http.callers import Caller, Reading
-from service.http.paging import Listing
-from service.http.problems import Problem
+from service.http.paging import Listing, Row
+from service.http.problems import Descriptions, Problem, RouteOptions
 from service.http.state import Shared, State
 from service.vo.parameters import (
     JSON,
@@ -62,14 +62,14 @@ class VotableErrors(PlainErrors):
         return Response(content, problem.status, headers=problem.headers, media_type=VOTABLE_TYPE)
 
 
-VOTABLE_ERROR: dict[int | str, dict[str, Any]] = {
+VOTABLE_ERROR: Descriptions = {
     "4XX": {
         "content": {VOTABLE_TYPE: {}, "application/problem+json": {}},
         "description": "A VOTable with QUERY_STATUS=ERROR; problem details if the service is not called by this host "
         "name",
     }
 }
-LIST: dict[str, Any] = {
+LIST: RouteOptions = {
     "response_class": Response,
     "responses": {
         200: {
@@ -92,7 +92,7 @@ router = APIRouter(prefix="/vo", tags=["VO"], route_class=VotableErrors)
 def list_vo_products(request: Request, caller: Reading, state: Shared, fields: Fields) -> Response:
     """Your products, newest first. A harvester reads pages until it meets a product that it knows."""
 
-    def records(rows: Sequence[ProductRow]) -> list[dict[str, Any]]:
+    def records(rows: Sequence[ProductRow]) -> list[dict[str, object]]:
         images = state.catalogue.rows(ImageRow, {row.image_id for row in rows}, caller.owner)
         return [product_record(row, images.get(row.image_id), base_url(request)) for row in rows]
 
@@ -105,7 +105,7 @@ def list_vo_products(request: Request, caller: Reading, state: Shared, fields: F
 def list_vo_psfs(request: Request, caller: Reading, state: Shared, fields: Fields) -> Response:
     """Your PSFs, newest first. `t_min` and `t_max` are the validity of certified PSFs."""
 
-    def records(rows: Sequence[PsfRow]) -> list[dict[str, Any]]:
+    def records(rows: Sequence[PsfRow]) -> list[dict[str, object]]:
         return [psf_record(row, base_url(request)) for row in rows]
 
     page = partial(state.catalogue.page, PsfRow, owner=caller.owner)
@@ -130,7 +130,7 @@ def row_named(state: State, caller: Caller, name: str) -> ProductRow | PsfRow | 
     return next((row for row in rows if row is not None), None)
 
 
-def product_record(row: ProductRow, image: ImageRow | None, base: str) -> dict[str, Any]:
+def product_record(row: ProductRow, image: ImageRow | None, base: str) -> dict[str, object]:
     """The values of a product's columns. image: the input; None if the service does not keep it (bulk runs over an
     archive).
     """
@@ -162,7 +162,7 @@ def product_record(row: ProductRow, image: ImageRow | None, base: str) -> dict[s
     }
 
 
-def psf_record(row: PsfRow, base: str) -> dict[str, Any]:
+def psf_record(row: PsfRow, base: str) -> dict[str, object]:
     """The values of a PSF's columns."""
     shape = row.details.get("shape") or (None, None)
     return _record(row, PSF, title(row.name, row.version, None), base) | {
@@ -183,7 +183,7 @@ def psf_record(row: PsfRow, base: str) -> dict[str, Any]:
     }
 
 
-def _record(row: ProductRow | PsfRow, kind: str, title: str | None, base: str) -> dict[str, Any]:
+def _record(row: ProductRow | PsfRow, kind: str, title: str | None, base: str) -> dict[str, object]:
     """The values of the columns that both lists have."""
     name = did(kind, row.id)
     return {
@@ -211,8 +211,8 @@ def _listed(
     request: Request,
     fields: Mapping[str, list[str]],
     table: Table,
-    page: Callable[..., Sequence[Any]],
-    records: Callable[[Sequence[Any]], list[dict[str, Any]]],
+    page: Callable[..., Sequence[Row]],
+    records: Callable[[Sequence[Row]], list[dict[str, object]]],
 ) -> Response:
     """The answer to a request for a list."""
     answer_format = format_of(fields, VOTABLE, JSON)

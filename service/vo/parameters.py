@@ -18,7 +18,7 @@ from fastapi.responses import PlainTextResponse
 from fastapi.routing import APIRoute
 
 from service.http.forms import FORM, URL_ENCODED, FormPart, chunks_of, media_type_of, pieces_of
-from service.http.problems import Problem
+from service.http.problems import Descriptions, Problem
 
 MAX_FORM_BYTES = 2**20
 MAX_FIELDS = 64
@@ -164,7 +164,7 @@ def format_of(fields: Mapping[str, list[str]], *allowed: str) -> str:
 
 
 # OpenAPI description of the errors of routes of the class PlainErrors.
-PLAIN_ERRORS: dict[str | int, dict[str, Any]] = {
+PLAIN_ERRORS: Descriptions = {
     "4XX": {
         "content": {"text/plain": {}, "application/problem+json": {}},
         "description": "What was expected, what was received, and what to do next; as problem details if the request "
@@ -197,7 +197,7 @@ def base_url(request: Request) -> str:
     return str(request.base_url).rstrip("/")
 
 
-def query(**parameters: str) -> dict[str, Any]:
+def query(**parameters: str) -> dict[str, object]:
     """OpenAPI description of parameters that a request has in its address."""
     return {
         "parameters": [

@@ -12,7 +12,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from service.vo.parameters import NO_XML
 from workers.settings import software_version
@@ -307,7 +307,7 @@ class Service:
 def table_document(
     name: str,
     columns: Sequence[Column],
-    rows: Sequence[Mapping[str, Any]],
+    rows: Sequence[Mapping[str, object]],
     *,
     status: str = "OK",
     infos: Mapping[str, str] | None = None,
@@ -368,7 +368,7 @@ def _field(votable: tree.VOTableFile, column: Column) -> tree.Field:
     return field
 
 
-def _stored(column: Column, value: Any) -> Any:
+def _stored(column: Column, value: object) -> object:
     if column.datatype != "char":
         return 0 if value is None else value
     # The type char holds ASCII; a name or an ID of a request may contain other characters.

@@ -8,7 +8,6 @@ because the web process must not import tasks.
 from __future__ import annotations
 
 import logging
-from typing import Any
 
 from celery import Celery
 from kombu import Connection
@@ -102,7 +101,7 @@ def check(url: str) -> None:
                 channel.client.linsert(broker_name(queue), "BEFORE", NO_MESSAGE, "")
 
 
-def _transport_options(settings: Settings) -> dict[str, Any]:
+def _transport_options(settings: Settings) -> dict[str, object]:
     if not settings.embedded:
         patience = {"socket_connect_timeout": 5, "socket_timeout": 10}
         return {**patience, "queue_order_strategy": "workers.broker.order:MostUrgentFirst"}

@@ -25,6 +25,7 @@ from typing import Any
 from celery import bootsteps
 from celery.worker import state
 from celery.worker.consumer import Consumer
+from kombu import Connection
 from kombu.exceptions import ChannelError
 from kombu.transport import filesystem, redis
 from kombu.utils.json import dumps
@@ -49,7 +50,7 @@ class MostUrgentFirst(priority_cycle):
 class _InOrder(FairCycle):
     """For the folder broker: reads the first queue that has a message."""
 
-    def get(self, callback: Callable[..., Any], **options: Any) -> Any:
+    def get(self, callback: Callable[..., None], **options: float | None) -> object:
         """Pass one message to the callback. Raises ``predicate`` if there is no message."""
         for queue in by_urgency(self.resources):
             try:
@@ -59,7 +60,7 @@ class _InOrder(FairCycle):
         raise self.predicate
 
 
-def _take(read: Callable[[], Any]) -> dict[str, Any] | None:
+def _take(read: Callable[[], Any]) -> dict[str, object] | None:
     """Read a message, and make it anew from its task, its job id and its queue.
 
     Returns None, and writes a line into the log, if this service did not send the message.
@@ -106,7 +107,7 @@ class _FolderChannel(filesystem.Channel):
     incompletely written or a named pipe.
     """
 
-    def get_table(self, exchange: str) -> list[Any]:
+    def get_table(self, exchange: str) -> list[filesystem.exchange_queue_t]:
         """The queues bound to an exchange; empty if the file is damaged, for example by a power failure, or no plain
         file.
         """
@@ -127,11 +128,11 @@ class _FolderChannel(filesystem.Channel):
             if binding not in bound:
                 _write_whole(self._exchange_file(exchange), [binding, *bound])
 
-    def _put(self, queue: str, payload: Any, **_: Any) -> None:  # type: ignore[override]  # kombu has two
+    def _put(self, queue: str, payload: object, **_: object) -> None:  # type: ignore[override]  # kombu has two
         name = f"{time.monotonic_ns() // 1_000_000}_{uuid.uuid4()}.{queue}.msg"
         _write_whole(Path(self.data_folder_out) / name, payload)
 
-    def _get(self, queue: str, timeout: float | None = None) -> dict[str, Any]:
+    def _get(self, queue: str, timeout: float | None = None) -> dict[str, object]:
         folder = Path(self.data_folder_in)
         for name in sorted(os.listdir(folder)):
             if name.partition(".")[2] == f"{queue}.msg":
@@ -162,7 +163,7 @@ def _taken(file: Path) -> bytes | None:
     return content
 
 
-def _write_whole(file: Path, content: Any) -> None:
+def _write_whole(file: Path, content: object) -> None:
     """Write a file atomically. Raises ``ChannelError``."""
     try:
         write_whole(file, dumps(content))
@@ -182,7 +183,7 @@ class FolderTransport(filesystem.Transport):
         """
         return {}
 
-    def drain_events(self, connection: Any, timeout: float | None = None, **_: Any) -> None:
+    def drain_events(self, connection: object, timeout: float | None = None, **_: object) -> None:
         """Deliver one message. Raises ``TimeoutError`` if no message arrives in time, or at once if the worker must
         stop.
 
@@ -210,7 +211,7 @@ class PatientConsumer(Consumer):
     Celery itself ends the worker after 100 attempts.
     """
 
-    def connect(self) -> Any:
+    def connect(self) -> Connection:
         """The connection, once the broker accepts messages. Raises ``WorkerShutdown`` if the worker must stop."""
         told = ""
         while self.app.conf.broker_transport is None:  # the folder of the embedded mode needs no server
@@ -223,7 +224,8 @@ class PatientConsumer(Consumer):
                     told = str(error)
                     log.warning("waiting for the broker (%s): %s", type(error).__name__, told)
                 time.sleep(WAIT_S)
-        return super().connect()
+        connection: Connection = super().connect()
+        return connection
 
 
 class TakeWhatCanStart(bootsteps.StartStopStep):
@@ -235,7 +237,7 @@ class TakeWhatCanStart(bootsteps.StartStopStep):
 
     requires = ("celery.worker.consumer.tasks:Tasks",)
 
-    def start(self, consumer: Any) -> None:
+    def start(self, consumer: Consumer) -> None:
         """Make the channel check whether the pool has an idle process, before it checks its own limit of messages;
         for Redis, also make it drop messages that this service did not send.
         """

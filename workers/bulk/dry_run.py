@@ -7,11 +7,11 @@ Therefore an image whose pixels cannot be used is found only by the run.
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import random
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 from pydantic import BaseModel, Field
@@ -26,6 +26,7 @@ from workers.catalogue.bulks import BulkImage
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ImageRow, ProductRow
 from workers.contract.bulk import BulkRequest
+from workers.contract.documents import header_json
 from workers.contract.identities import product_identity
 from workers.contract.jobs import JobError
 from workers.contract.requests import ResolvedDeconvolve
@@ -182,7 +183,7 @@ class _DryRun:
             if image.uploaded or "{product}" not in (self._request.output.layout or "{product}"):
                 self._example_output = self._example_output or archive_files.shown(target)
         self._existing += exists
-        self._memory_mib = max(self._memory_mib, estimate["memory_mib"])
+        self._memory_mib = max(self._memory_mib, int(estimate["memory_mib"]))
         if not exists:
             start_s = estimate["start_s"]
             self._seconds += start_s * estimates.factor(estimates.BULK, start_s, catalogue)
@@ -217,10 +218,8 @@ class _DryRun:
         path = Path(image.source)
         try:
             with archive_files.opened(path, archive_files.roots(self._settings.bulk_roots)) as file:
-                summary = dataclasses.asdict(
-                    read_summary(archive_files.reopened(file), self._settings.image_limits)
-                )
-                return Source(NO_ID, summary, path.name, path)
+                summary = read_summary(archive_files.reopened(file), self._settings.image_limits)
+                return Source(NO_ID, header_json(asdict(summary)), path.name, path)
         except OSError as error:
             raise archive_files.unreadable(error) from error
 

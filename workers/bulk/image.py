@@ -22,6 +22,7 @@ from workers.bulk import outputs
 from workers.bulk.runs import resolved_image
 from workers.catalogue.tables import BulkItemRow, BulkRow, ImageRow, ProductRow
 from workers.contract.bulk import BulkWork
+from workers.contract.documents import header_json
 from workers.contract.identities import product_identity
 from workers.contract.requests import ResolvedDeconvolve
 from workers.files import archive as archive_files
@@ -169,7 +170,7 @@ def _source(workspace: CatalogueWorkspace, item: BulkItemRow) -> Iterator[output
             if is_disk_full(error):  # the copy cannot be written; the same error would occur for every image
                 raise
             raise archive_files.unreadable(error) from error
-        summary = dataclasses.asdict(read_summary(copy, workspace.limits))
+        summary = header_json(dataclasses.asdict(read_summary(copy, workspace.limits)))
         yield outputs.Source(sha256, summary, path.name, path, copy)
 
 

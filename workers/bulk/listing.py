@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 from urllib.parse import quote, unquote_to_bytes
 
 from psfcore.errors import DataError
@@ -19,6 +19,7 @@ from psfcore.fits.blocks import FitsLimits
 from workers.catalogue.bulks import NOT_UTF_8, TOO_LONG, BulkImage
 from workers.catalogue.tables import MOST_LETTERS, BulkRow
 from workers.contract.bulk import BulkWork, Condition
+from workers.contract.documents import PositionJson
 from workers.contract.jobs import JobError
 from workers.files import archive as archive_files
 from workers.settings import Settings
@@ -42,14 +43,14 @@ class SearchPosition:
     pattern: int
     names: archive_files.Position
 
-    def stored(self) -> dict[str, Any]:
+    def stored(self) -> PositionJson:
         """The position as JSON. Names may have bytes that are not UTF-8, which PostgreSQL refuses; they are written as
         %FF.
         """
         return {"pattern": self.pattern, "names": [quote(os.fsencode(name), safe="") for name in self.names]}
 
     @classmethod
-    def of(cls, stored: dict[str, Any]) -> SearchPosition:
+    def of(cls, stored: PositionJson) -> SearchPosition:
         """The position that was stored."""
         names = tuple(os.fsdecode(unquote_to_bytes(name)) for name in stored["names"])
         return cls(stored["pattern"], names)

@@ -7,13 +7,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 from psfcore.errors import DataError
 from psfcore.files import sha256_of
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.cards import optional_text
-from psfcore.fits.header import read_first_image
+from psfcore.fits.header import HeaderJson, read_first_image
 from workers.contract.bulk import MOST_IN_PATH, FieldValue, Output, laid_out
 from workers.files import archive as archive_files
 from workers.files.store import is_disk_full
@@ -29,7 +28,7 @@ class Source:
     """
 
     sha256: str
-    summary: dict[str, Any]
+    summary: HeaderJson
     name: str
     path: Path | None = None
     copy: Path | None = None

@@ -12,9 +12,9 @@ from __future__ import annotations
 import logging
 import time
 from pathlib import Path
-from typing import Any
 
 from psfcore.errors import DataError
+from psfcore.fits.header import HeaderJson
 from workers.catalogue.bulks import new_id
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import BulkRow, ImageRow, JobRow, PsfRow
@@ -81,7 +81,7 @@ def new_run(
 
 
 def resolved_image(
-    bulk: BulkRow, image_id: str, summary: dict[str, Any], catalogue: Catalogue
+    bulk: BulkRow, image_id: str, summary: HeaderJson, catalogue: Catalogue
 ) -> ResolvedDeconvolve:
     """The deconvolution of an image of a run. Its PSF is that of the run, or the one that the run's context pins for
     it.

@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from psfcore.errors import DataError
 from workers.bulk.image import Destination, Outcome, Ready, compute_one, done_before, read_one, write_one
@@ -41,11 +41,11 @@ Answer = TypeVar("Answer")
 log = logging.getLogger(__name__)
 
 
-def bulk_turn(workspace: CatalogueWorkspace, parameters: Mapping[str, Any]) -> str:
+def bulk_turn(workspace: CatalogueWorkspace, parameters: Mapping[str, object]) -> str:
     """Deconvolve images of a bulk run; returns the id of the run. Raises ``TurnOver`` if images are left but the turn
     must end.
     """
-    bulk_id: str = parameters["bulk_id"]
+    bulk_id = str(parameters["bulk_id"])
     bulk = workspace.catalogue.bulks.get(bulk_id)
     if bulk is not None and bulk.phase in AT_WORK:
         with ThreadPoolExecutor(4, "bulk") as pool:
@@ -280,7 +280,7 @@ class _Turn:
 
     # Threads and reports ------------------------------------------------------------------------------
 
-    def _submit(self, work: Callable[..., Answer], *arguments: Any) -> Future[Answer]:
+    def _submit(self, work: Callable[..., Answer], *arguments: object) -> Future[Answer]:
         """Run a function in a thread, with the trace and the log fields of this thread."""
         return self._pool.submit(contextvars.copy_context().run, work, *arguments)
 

@@ -162,7 +162,7 @@ class Keys(Queries):
         query = select(KeyRow)
         if owner is not None:
             query = query.where(KeyRow.owner == owner)
-        return self._database.all(newest_first(query, KeyRow, limit, after))
+        return self._database.all(newest_first(query, (KeyRow.created_at, KeyRow.id), limit, after))
 
     def all(self) -> Sequence[KeyRow]:
         """All keys, including revoked and expired ones, oldest first."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 from sqlalchemy import Select, exists, select
 from sqlalchemy.orm import Session
@@ -76,7 +75,7 @@ class AffectedProducts(Queries):
         return affected
 
 
-def _next_psfs(owner: str, superseded: bool, after: str) -> Select[Any]:
+def _next_psfs(owner: str, superseded: bool, after: str) -> Select[PsfRow]:
     """Deprecated PSFs with which products were made, sorted by id."""
     used = exists().where(ProductRow.owner == PsfRow.owner, ProductRow.psf_id == PsfRow.id)
     query = select(PsfRow).where(
@@ -92,7 +91,11 @@ def _affected(
 ) -> list[AffectedProduct]:
     """Products of a PSF, newest first."""
     query = select(ProductRow).where(ProductRow.owner == psf.owner, ProductRow.psf_id == psf.id)
-    rows = session.scalars(newest_first(query, ProductRow, limit, after)).all() if limit else ()
+    rows = (
+        session.scalars(newest_first(query, (ProductRow.created_at, ProductRow.id), limit, after)).all()
+        if limit
+        else ()
+    )
     redo_with = _last_successor(session, psf) if rows else None
     return [AffectedProduct(row, psf, redo_with) for row in rows]
 

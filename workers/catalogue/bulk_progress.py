@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
-from sqlalchemy import ColumnElement, exists, func, select, tuple_
+from sqlalchemy import ColumnElement, SQLColumnExpression, exists, func, select, tuple_
 
 from workers.catalogue.database import Queries, newest_first
 from workers.catalogue.tables import BulkItemRow, BulkRow, ImageRow, ProductRow
@@ -121,7 +120,7 @@ class BulkProgress(Queries):
         """Ids of the owner's newest uploaded images that have no product."""
         made = exists().where(ProductRow.owner == ImageRow.owner, ProductRow.image_id == ImageRow.id)
         query = select(ImageRow.id).where(ImageRow.owner == owner, ~made)
-        return self._database.all(newest_first(query, ImageRow, limit))
+        return self._database.all(newest_first(query, (ImageRow.created_at, ImageRow.id), limit))
 
     def names_of_uploads(self, ids: Sequence[str], owner: str) -> dict[str, str]:
         """The file names of these uploaded images, by id. Images without a file name are left out."""
@@ -153,7 +152,9 @@ class BulkProgress(Queries):
         deconvolved = BulkRow.done - BulkRow.reused
         return self._sums({"deconvolved": deconvolved, "reused": BulkRow.reused, "failed": BulkRow.failed})
 
-    def _sums(self, counts: dict[str, Any], *conditions: ColumnElement[bool]) -> dict[str, int]:
+    def _sums(
+        self, counts: Mapping[str, SQLColumnExpression[int]], *conditions: ColumnElement[bool]
+    ) -> dict[str, int]:
         """The sum of each count over the runs that meet the conditions."""
         query = select(*(func.coalesce(func.sum(one), 0) for one in counts.values())).where(*conditions)
         (sums,) = self._database.lines(query)

@@ -12,7 +12,6 @@ import time
 import uuid
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from sqlalchemy import ColumnElement, Select, case, delete, exists, func, insert, null, select, update
 from sqlalchemy.orm import Session
@@ -24,6 +23,7 @@ from workers.catalogue.jobs import Lease
 from workers.catalogue.quotas import lock_owner
 from workers.catalogue.tables import BulkItemRow, BulkRow, JobRow
 from workers.contract.bulk import AT_WORK, DELETABLE, OPEN, STOPPED, BulkPhase, ItemState
+from workers.contract.documents import PositionJson
 from workers.contract.jobs import Fault, JobError, Phase
 
 # Errors of files whose paths the catalogue cannot store. Such files are not retried, because the stored path is wrong.
@@ -203,7 +203,7 @@ class Bulks(Queries):
             return bulk
 
     def add_listed(
-        self, bulk_id: str, lease: Lease, images: Sequence[BulkImage], listed_to: Mapping[str, Any]
+        self, bulk_id: str, lease: Lease, images: Sequence[BulkImage], listed_to: PositionJson
     ) -> bool:
         """Add images to a run. Returns False if another lease now lists the files, or if the run is not LISTING.
 
@@ -216,7 +216,7 @@ class Bulks(Queries):
             _add(session, bulk_id, bulk.total, images)
             bulk.total += len(images)
             bulk.failed += sum(image.error is not None for image in images)
-            bulk.listed_to = dict(listed_to)
+            bulk.listed_to = listed_to
             return True
 
     def end_listing(self, bulk_id: str, lease: Lease) -> bool:
@@ -264,7 +264,7 @@ class Bulks(Queries):
         values = {"state": ItemState.WAITING, "attempts": BulkItemRow.attempts - 1, "token": None}
         return self._database.set(BulkItemRow, _held(item), **values)
 
-    def finish(self, item: BulkItemRow, *, reused: bool, **values: Any) -> bool:
+    def finish(self, item: BulkItemRow, *, reused: bool, **values: object) -> bool:
         """Record that an image is done."""
         values |= {"state": ItemState.DONE, "reused": reused, "error": None}
         return self._end(item, values, done=1, reused=int(reused))
@@ -273,7 +273,7 @@ class Bulks(Queries):
         """Record that an image failed."""
         return self._end(item, {"state": ItemState.FAILED, "error": error.model_dump(mode="json")}, failed=1)
 
-    def _end(self, item: BulkItemRow, values: Mapping[str, Any], **counts: int) -> bool:
+    def _end(self, item: BulkItemRow, values: Mapping[str, object], **counts: int) -> bool:
         with self._database.writing.begin() as session:
             ended = update(BulkItemRow).where(*_held(item))
             if not execute(session, ended.values(ended_at=time.time(), token=None, **values)):
@@ -281,7 +281,7 @@ class Bulks(Queries):
             _count(session, item.bulk_id, **counts)
             return True
 
-    def _set(self, bulk_id: str, phases: Iterable[BulkPhase], **values: Any) -> bool:
+    def _set(self, bulk_id: str, phases: Iterable[BulkPhase], **values: object) -> bool:
         return self._database.set(
             BulkRow, [BulkRow.id == bulk_id, BulkRow.phase.in_(sorted(phases))], **values
         )
@@ -305,7 +305,7 @@ def _add(session: Session, bulk_id: str, first: int, images: Sequence[BulkImage]
         session.execute(insert(BulkItemRow), [_values(bulk_id, number, image) for number, image in batch])
 
 
-def _values(bulk_id: str, position: int, image: BulkImage) -> Mapping[str, Any]:
+def _values(bulk_id: str, position: int, image: BulkImage) -> dict[str, object]:
     failed = image.error is not None
     return {
         "bulk_id": bulk_id,

@@ -9,9 +9,9 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
-from sqlalchemy import Select, String, cast, create_engine, false, select
+from sqlalchemy import ColumnElement, Select, String, cast, create_engine, false, select
 from sqlalchemy.exc import DatabaseError, IntegrityError
 from sqlalchemy.orm import Session
 from sqlalchemy.orm.attributes import flag_modified
@@ -228,10 +228,12 @@ class Catalogue:
         for column, value in equal.items():
             if value is not None:
                 query = query.where(getattr(table, column) == value)
-        return self._database.all(newest_first(query, table, limit, after))
+        return self._database.all(newest_first(query, (table.created_at, table.id), limit, after))
 
 
-def _in_batches(table: Any, identities: Collection[str], owner: str) -> Iterator[list[Any]]:
+def _in_batches(
+    table: type[ListedRow | SolutionRow], identities: Collection[str], owner: str
+) -> Iterator[list[ColumnElement[bool]]]:
     """The conditions that select an owner's rows with these ids, for one query after the other."""
     ids = list(identities)
     for at in range(0, len(ids), _IN_A_QUERY):

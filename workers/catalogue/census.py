@@ -94,7 +94,7 @@ class Census(Queries):
             func.sum(func.coalesce(JobRow.ended_at - JobRow.started_at, 0.0)),
         ).group_by(JobRow.kind, JobRow.phase)
         return [
-            JobTally(kind, phase, int(jobs), int(attempts), int(retries), float(run_s))
+            JobTally(kind, phase, int(jobs), int(attempts), int(retries), float(run_s or 0.0))
             for kind, phase, jobs, attempts, retries, run_s in self._database.lines(query)
         ]
 
@@ -179,5 +179,6 @@ class KeptStageTimes(Queries):
             .limit(limit)
         )
         return [
-            ((one or {}).get("start_s", 0.0), float(took_s)) for one, took_s in self._database.lines(query)
+            ((one or {}).get("start_s", 0.0), float(took_s or 0.0))
+            for one, took_s in self._database.lines(query)
         ]

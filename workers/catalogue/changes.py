@@ -10,9 +10,10 @@ owner, and at most ``MOST`` rows where nothing else bounds their number. Complet
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 from sqlalchemy import ColumnElement, Select, select, true, tuple_
+from sqlalchemy.orm import InstrumentedAttribute
 
 from workers.catalogue.database import Database
 from workers.catalogue.tables import BulkRow, JobRow
@@ -34,7 +35,7 @@ class Changes(Generic[Row]):
         database: Database,
         table: type[Row],
         phases: Collection[str],
-        *order: Any,
+        *order: InstrumentedAttribute[str],
         only: ColumnElement[bool] | None = None,
     ) -> None:
         """phases: of rows that have not ended. order: of these rows, before the newest first. only: a condition on the

@@ -12,7 +12,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 from sqlalchemy import Select, exists, select
 from sqlalchemy.exc import IntegrityError
@@ -77,7 +76,7 @@ class Series(Queries):
         """The variants of a channel of which a PSF is certified, or pinned by a context: their channels, such as
         174-open_2.
         """
-        table: Any = PsfSeriesRow if context_id is None else PsfPinRow
+        table: type[PsfSeriesRow | PsfPinRow] = PsfSeriesRow if context_id is None else PsfPinRow
         start, end = f"{instrument}/{channel}{SEPARATOR}", f"/{kind}"
         certified = exists().where(
             PsfRow.owner == PsfSeriesRow.owner,
@@ -128,8 +127,8 @@ class Series(Queries):
             if context_id is None:
                 if not may_interpolate(session, series, owner):
                     return None
-                table: Any = PsfRow
-                rows: Any = select(PsfRow.id, PsfRow.valid_from, PsfRow.valid_to).where(
+                table: type[PsfRow | PsfPinRow] = PsfRow
+                rows = select(PsfRow.id, PsfRow.valid_from, PsfRow.valid_to).where(
                     PsfRow.status == PsfStatus.CERTIFIED
                 )
             else:
@@ -141,9 +140,12 @@ class Series(Queries):
             starts = table.valid_from
             before = session.execute(rows.where(starts <= at).order_by(starts.desc()).limit(1)).first()
             after = session.execute(rows.where(starts > at).order_by(starts).limit(1)).first()
-        if before is None or after is None or before[2] > at:
+        if before is None or after is None:
             return None
-        return Ends(before[0], before[2], after[0], after[1])
+        (before_id, _, before_end), (after_id, after_start, _) = before, after
+        if before_end is None or after_start is None or before_end > at:
+            return None
+        return Ends(before_id, before_end, after_id, after_start)
 
 
 def may_interpolate(session: Session, series: str, owner: str) -> bool:
@@ -152,7 +154,7 @@ def may_interpolate(session: Session, series: str, owner: str) -> bool:
     return latest is not None and latest.interpolated
 
 
-def _changes(series: str, owner: str) -> Select[Any]:
+def _changes(series: str, owner: str) -> Select[SeriesChangeRow]:
     """The changes of a series, latest first."""
     query = select(SeriesChangeRow).where(SeriesChangeRow.owner == owner, SeriesChangeRow.series == series)
     return query.order_by(SeriesChangeRow.number.desc())

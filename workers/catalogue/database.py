@@ -7,13 +7,15 @@ import sqlite3
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar, TypeVarTuple
 
 from sqlalchemy import (
     ColumnElement,
+    Connection,
     Delete,
     Double,
     Engine,
+    Row,
     Select,
     Update,
     and_,
@@ -29,7 +31,7 @@ from sqlalchemy.engine import CursorResult
 from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from sqlalchemy.ext.compiler import compiles
-from sqlalchemy.orm import InstrumentedAttribute, Session, sessionmaker
+from sqlalchemy.orm import DeclarativeBase, InstrumentedAttribute, Session, sessionmaker
 
 from psfcore.errors import DataError
 
@@ -38,9 +40,11 @@ READ_ONLY = "25006"  # sqlstate of a change in a database that only reads, such 
 # Classes of sqlstates: a lost connection, a transaction that must be run again, no resources, the operator's
 # intervention (a shutdown, a start, a limit on time), and errors of the system below PostgreSQL.
 _AWAY = frozenset({"08", "40", "53", "57", "58"})
-Row = TypeVar("Row")
+Table = TypeVar("Table")
 Value = TypeVar("Value")
-Query = TypeVar("Query", bound=Select[*tuple[Any, ...]])
+Columns = TypeVarTuple("Columns")
+# The columns created_at and id of a table, by which its rows are sorted.
+Dates = tuple[InstrumentedAttribute[float], InstrumentedAttribute[str]]
 
 
 class Now(ColumnElement[float]):
@@ -54,13 +58,13 @@ class Now(ColumnElement[float]):
 
 
 @compiles(Now)
-def _now(*_: Any, **__: Any) -> str:
+def _now(*_: object, **__: object) -> str:
     # PostgreSQL can use an index with this clock, because it is constant within a statement.
     return "CAST(extract(epoch FROM statement_timestamp()) AS double precision)"
 
 
 @compiles(Now, "sqlite")
-def _now_of_sqlite(*_: Any, **__: Any) -> str:
+def _now_of_sqlite(*_: object, **__: object) -> str:
     return "((julianday('now') - 2440587.5) * 86400.0)"
 
 
@@ -95,7 +99,7 @@ class Database:
         with self.reading() as session:
             return session.scalars(select(self.now)).one()
 
-    def count(self, table: type[Any], *conditions: ColumnElement[bool]) -> int:
+    def count(self, table: type[DeclarativeBase], *conditions: ColumnElement[bool]) -> int:
         """The number of rows that meet all conditions."""
         return self.first(select(func.count()).select_from(table).where(*conditions)) or 0
 
@@ -109,16 +113,16 @@ class Database:
         with self.reading() as session:
             return session.scalars(query.limit(1)).first()
 
-    def lines(self, query: Select[*tuple[Any, ...]]) -> Sequence[Any]:
+    def lines(self, query: Select[*Columns]) -> Sequence[Row[*Columns]]:
         """The values of all columns that a query selects, row by row."""
         with self.reading() as session:
             return session.execute(query).all()
 
-    def any(self, query: Select[Any]) -> bool:
+    def any(self, query: Select[Value]) -> bool:
         """Whether a query selects a row."""
         return self.first(query) is not None
 
-    def row(self, table: type[Row], key: str | tuple[str, str]) -> Row | None:
+    def row(self, table: type[Table], key: str | tuple[str, str]) -> Table | None:
         """The row with this primary key, or None."""
         with self.reading() as session:
             return session.get(table, key)
@@ -128,7 +132,9 @@ class Database:
         with self.writing.begin() as session:
             return execute(session, statement)
 
-    def set(self, table: type[Any], conditions: Sequence[Any], **values: Any) -> bool:
+    def set(
+        self, table: type[DeclarativeBase], conditions: Sequence[ColumnElement[bool]], **values: object
+    ) -> bool:
         """Set columns of the rows that meet all conditions, by one UPDATE; returns whether it changed a row."""
         return self.change(update(table).where(*conditions).values(**values)) > 0
 
@@ -168,17 +174,20 @@ def is_away(error: BaseException) -> bool:
     return sqlstate == READ_ONLY or sqlstate[:2] in _AWAY
 
 
-def newest_first(query: Query, table: Any, limit: int, after: tuple[float, str] | None = None) -> Query:
+def newest_first(
+    query: Select[*Columns], dates: Dates, limit: int, after: tuple[float, str] | None = None
+) -> Select[*Columns]:
     """A page of a query for rows of a table, newest first.
 
+    dates: the columns created_at and id of the table.
     after: (created_at, id) of the last row of the previous page; None for the first page.
     """
     if after is not None:
-        query = query.where(tuple_(table.created_at, table.id) < after)
-    return query.order_by(table.created_at.desc(), table.id.desc()).limit(limit)
+        query = query.where(tuple_(*dates) < after)
+    return query.order_by(*(column.desc() for column in dates)).limit(limit)
 
 
-def insert_into(session: Session, table: type[Any]) -> postgresql.Insert | sqlite.Insert:
+def insert_into(session: Session, table: type[DeclarativeBase]) -> postgresql.Insert | sqlite.Insert:
     """An INSERT with the method ``on_conflict_do_nothing``, which each database has in its own dialect."""
     insert = sqlite.insert if session.get_bind().dialect.name == "sqlite" else postgresql.insert
     return insert(table)
@@ -211,7 +220,7 @@ def open_engine(url: str) -> Engine:
     engine = create_engine(url, connect_args={"timeout": PATIENCE_S}, json_serializer=strict_json)
 
     @event.listens_for(engine, "connect")
-    def _pragmas(connection: Any, _record: Any) -> None:
+    def _pragmas(connection: sqlite3.Connection, _record: object) -> None:
         # The driver would send BEGIN too late for a compare-and-set; see _begin.
         connection.isolation_level = None
         _write_ahead(connection)
@@ -219,7 +228,7 @@ def open_engine(url: str) -> Engine:
         connection.execute("PRAGMA foreign_keys=ON")
 
     @event.listens_for(engine, "begin")
-    def _begin(connection: Any) -> None:
+    def _begin(connection: Connection) -> None:
         # IMMEDIATE waits for the write lock at the start. Without it, a transaction that reads first and writes later
         # would fail with "database is locked" instead of waiting. Readers need no lock.
         reads = connection.get_execution_options().get("read_only", False)
@@ -245,6 +254,6 @@ def _write_ahead(connection: sqlite3.Connection) -> None:
             time.sleep(0.02)
 
 
-def strict_json(value: Any) -> str:
+def strict_json(value: object) -> str:
     """Write JSON. Raises ValueError for NaN and infinity: PostgreSQL refuses them, and clients cannot read them."""
     return json.dumps(value, allow_nan=False)

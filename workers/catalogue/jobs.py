@@ -11,9 +11,8 @@ from __future__ import annotations
 import logging
 import time
 import uuid
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from sqlalchemy import ColumnElement, and_, case, func, literal, or_, select, update
 from sqlalchemy.exc import IntegrityError
@@ -42,12 +41,12 @@ class Jobs(Queries):
     def submit(
         self,
         kind: str,
-        parameters: dict[str, Any],
+        parameters: Mapping[str, object],
         request_key: str,
         owner: str,
         *,
         queue: Queue | None = None,
-        estimate: dict[str, Any] | None = None,
+        estimate: dict[str, float] | None = None,
     ) -> tuple[JobRow, bool]:
         """Queue a new job, or share the job of an identical request that is queued, executing or completed. Returns
         the job, and whether it is new.
@@ -208,7 +207,7 @@ class Jobs(Queries):
         """End a cancelled job as ABORTED, after its worker has stopped it. Returns False if the lease is lost."""
         return self._end(lease, Phase.ABORTED, JobRow.cancel_requested.is_(True))
 
-    def _end(self, lease: Lease, phase: Phase, *conditions: ColumnElement[bool], **values: Any) -> bool:
+    def _end(self, lease: Lease, phase: Phase, *conditions: ColumnElement[bool], **values: object) -> bool:
         ended = {"phase": phase, "ended_at": self._database.now, "lease": None}
         return self._database.set(JobRow, [*_held(lease), *conditions], **ended, **values)
 
@@ -363,7 +362,7 @@ class Jobs(Queries):
         this = (JobRow.owner == owner, JobRow.work_key == work_key, is_at_work(JobRow.phase))
         return self._database.any(select(JobRow.id).where(*this))
 
-    def _again(self) -> dict[str, Any]:
+    def _again(self) -> dict[str, object]:
         """Values of an UPDATE that queues an executing job again, or aborts it if it was cancelled."""
         cancelled = JobRow.cancel_requested.is_(True)
         return {
@@ -372,7 +371,7 @@ class Jobs(Queries):
             "lease": None,
         }
 
-    def _note(self, conditions: Sequence[Any], **values: Any) -> bool:
+    def _note(self, conditions: Sequence[ColumnElement[bool]], **values: object) -> bool:
         """Make a change that streams of events do not report. Returns whether it changed the job."""
         return self._database.set(JobRow, conditions, changed_at=JobRow.changed_at, **values)
 
@@ -394,7 +393,7 @@ def is_at_work(phase: InstrumentedAttribute[str]) -> ColumnElement[bool]:
     return phase == literal(Phase.EXECUTING.value, literal_execute=True)
 
 
-def _held(lease: Lease) -> list[Any]:
+def _held(lease: Lease) -> list[ColumnElement[bool]]:
     return [
         JobRow.id == lease.job_id,
         JobRow.lease == lease.token,
@@ -439,7 +438,7 @@ class Parts(Queries):
         """Renew the lease. Returns False if another worker took the part or the part is done."""
         return self._database.set(PartRow, _holding(part), heartbeat_at=self._database.now)
 
-    def finish(self, part: PartRow, result: dict[str, Any]) -> bool:
+    def finish(self, part: PartRow, result: dict[str, object]) -> bool:
         """Store the result of a part. Returns False if the part already has a result.
 
         The first result is kept, even if the worker has lost the part, because every worker computes the same result.
@@ -450,7 +449,7 @@ class Parts(Queries):
         """Release a part without a result."""
         self._database.set(PartRow, _holding(part), token=None)
 
-    def results(self, owner: str, request_key: str) -> list[dict[str, Any]]:
+    def results(self, owner: str, request_key: str) -> list[dict[str, object]]:
         """Results of the parts that are done, sorted by number."""
         done = select(PartRow.result).where(*_of(owner, request_key), PartRow.result.is_not(None))
         return [dict(one) for one in self._database.all(done.order_by(PartRow.number)) if one]
@@ -460,10 +459,10 @@ def _of(owner: str, request_key: str) -> list[ColumnElement[bool]]:
     return [PartRow.owner == owner, PartRow.request_key == request_key]
 
 
-def _undone(part: PartRow) -> list[Any]:
+def _undone(part: PartRow) -> list[ColumnElement[bool]]:
     this = [*_of(part.owner, part.request_key), PartRow.number == part.number]
     return [*this, PartRow.result.is_(None)]
 
 
-def _holding(part: PartRow) -> list[Any]:
+def _holding(part: PartRow) -> list[ColumnElement[bool]]:
     return [*_undone(part), PartRow.token == part.token]

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 
 from psycopg import Connection, OperationalError
 from psycopg.abc import PQGen
+from sqlalchemy import Connection as SqlConnection
 from sqlalchemy import Engine, create_engine, event
 from sqlalchemy.engine import make_url
 
@@ -66,25 +67,29 @@ def open_postgres(url: str, **options: Any) -> Engine:
     engine = create_engine(url, pool_pre_ping=True, pool_timeout=POOL_S, connect_args=unset, **options)
 
     @event.listens_for(engine, "do_connect")
-    def _connect(_dialect: Any, _record: Any, arguments: Any, named: Any) -> PatientConnection:
+    def _connect(
+        _dialect: object, _record: object, arguments: list[str], named: dict[str, Any]
+    ) -> PatientConnection:
         return PatientConnection.connect(*arguments, **named)
 
     @event.listens_for(engine, "connect")
-    def _limit(connection: PatientConnection, _record: Any) -> None:
+    def _limit(connection: PatientConnection, _record: object) -> None:
         # Not among the options of the connection, which poolers such as PgBouncer refuse.
         connection.autocommit = True
         connection.execute(f"SET statement_timeout = '{STATEMENT_S:g}s'")
         connection.autocommit = False
 
     @event.listens_for(engine, "begin")
-    def _begin(connection: Any) -> None:
+    def _begin(connection: SqlConnection) -> None:
         unhurried = connection.get_execution_options().get("unhurried", False)
-        connection.connection.dbapi_connection.silence_s = math.inf if unhurried else SILENCE_S
+        patient = connection.connection.dbapi_connection
+        assert isinstance(patient, PatientConnection)
+        patient.silence_s = math.inf if unhurried else SILENCE_S
         if unhurried:
             connection.exec_driver_sql("SET LOCAL statement_timeout = 0")
 
     @event.listens_for(engine, "reset")
-    def _reset(connection: PatientConnection, _record: Any, _state: Any) -> None:
+    def _reset(connection: PatientConnection, _record: object, _state: object) -> None:
         connection.silence_s = PING_S
 
     return engine

@@ -10,7 +10,6 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 from sqlalchemy import Select, String, cast, select
 from sqlalchemy.orm import Session
@@ -68,7 +67,9 @@ class Psfs(Queries):
         self, filters: PsfFilter, owner: str, *, limit: int, after: tuple[float, str] | None = None
     ) -> Sequence[PsfRow]:
         """A page of PSFs, newest first. after: (created_at, id) of the last row of the previous page."""
-        return self._database.all(newest_first(_query(filters, owner), PsfRow, limit, after))
+        return self._database.all(
+            newest_first(_query(filters, owner), (PsfRow.created_at, PsfRow.id), limit, after)
+        )
 
     def emptied_by(self, filters: PsfFilter, owner: str) -> str | None:
         """Apply the filters one by one; return the name of the first filter after which no PSF is left, or None."""
@@ -122,13 +123,13 @@ class Psfs(Queries):
             before = PsfStatus(row.status)
             check_transition(before, change.status)
             if change.status == PsfStatus.CERTIFIED:
-                _certify(session, row, columns, change, by)
+                _certify(session, row, series, columns, change, by)
             else:
                 _deprecate(session, row, change, by)
             return row
 
 
-def _query(filters: PsfFilter, owner: str) -> Select[Any]:
+def _query(filters: PsfFilter, owner: str) -> Select[PsfRow]:
     """A query for the PSFs that meet the filters, unsorted.
 
     A context has few PSFs, and few PSFs are valid at one time. Therefore a subquery finds these PSFs first. The
@@ -150,7 +151,7 @@ def _query(filters: PsfFilter, owner: str) -> Select[Any]:
     return query
 
 
-def _pinned(filters: PsfFilter, owner: str) -> Select[Any]:
+def _pinned(filters: PsfFilter, owner: str) -> Select[str]:
     """Ids of the PSFs that a context pins; if a time is given, only those that are pinned for that time."""
     query = select(PsfPinRow.psf_id).where(
         PsfPinRow.owner == owner, PsfPinRow.context_id == filters.context_id
@@ -162,7 +163,7 @@ def _pinned(filters: PsfFilter, owner: str) -> Select[Any]:
     return query.distinct()  # a PSF may be pinned for several ranges
 
 
-def _latest_from(filters: PsfFilter, owner: str) -> Select[Any]:
+def _latest_from(filters: PsfFilter, owner: str) -> Select[str]:
     """For each series, the id of the certified PSF whose range begins last before ``filters.valid_at``.
 
     The ranges of a series do not overlap, so no other PSF of the series can be valid at that time.
@@ -196,7 +197,7 @@ def _certified_of(series: str, owner: str) -> Select[PsfRow]:
     )
 
 
-def _released(series: str, owner: str) -> Select[Any]:
+def _released(series: str, owner: str) -> Select[str]:
     released = PsfRow.status.in_((PsfStatus.CERTIFIED, PsfStatus.DEPRECATED))
     return select(PsfRow.version).where(PsfRow.owner == owner, PsfRow.series == series, released)
 
@@ -213,7 +214,7 @@ def existing_psf(session: Session, psf_id: str, owner: str, *, lock: bool = Fals
     return row
 
 
-def _series(row: PsfRow, change: StatusChange) -> tuple[str, dict[str, Any]]:
+def _series(row: PsfRow, change: StatusChange) -> tuple[str, dict[str, str | None]]:
     """The series of a PSF, completed by the change, and the columns that form its name.
 
     Raises ``DataError`` "line-known" or "no-line".
@@ -247,9 +248,11 @@ def _series(row: PsfRow, change: StatusChange) -> tuple[str, dict[str, Any]]:
     return series, columns | {"kind": kind, "series": series}
 
 
-def _certify(session: Session, row: PsfRow, columns: dict[str, Any], change: StatusChange, by: str) -> None:
+def _certify(
+    session: Session, row: PsfRow, series: str, columns: dict[str, str | None], change: StatusChange, by: str
+) -> None:
     _refuse(change, "deprecation", successor=change.successor)
-    version, series = row.version, columns["series"]
+    version = row.version
     if row.status == PsfStatus.DRAFT:
         version = check_version(change.version, session.scalars(_released(series, row.owner)))
     elif change.version not in (None, row.version):
@@ -283,8 +286,8 @@ def _certify(session: Session, row: PsfRow, columns: dict[str, Any], change: Sta
             "name it in `supersedes`, or change its range first",
         )
     validity_columns = {"valid_from": validity.start, "valid_to": validity.end}
-    columns = columns | validity_columns | {"status": PsfStatus.CERTIFIED, "version": version}
-    _write(session, row, change.reason, by, **columns)
+    status_columns = {"status": PsfStatus.CERTIFIED, "version": version}
+    _write(session, row, change.reason, by, **columns, **validity_columns, **status_columns)
 
 
 def validity_of(row: PsfRow) -> Validity:

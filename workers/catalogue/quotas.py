@@ -59,7 +59,7 @@ MOST_QUOTA_MIB = 2**31 - 1  # the largest number in the column of quotas
 FileRow = ImageRow | TransitRow | PsfRow | ProductRow | ReportRow | SolutionRow
 WITH_FILES: tuple[type[FileRow], ...] = (ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, SolutionRow)
 # The kinds of things that the operator can keep for some time only (setting HELIOPSF_KEEP_DAYS).
-UPLOADED: dict[str, type[Any]] = {"image": ImageRow, "transit": TransitRow}
+UPLOADED: dict[str, type[Base]] = {"image": ImageRow, "transit": TransitRow}
 KEPT: dict[str, type[Any]] = UPLOADED | {
     "product": ProductRow,
     "report": ReportRow,
@@ -133,7 +133,7 @@ class Quotas(Queries):
         ``usage``.
         """
         with self._database.reading() as session:
-            tables: tuple[Any, ...] = (OwnerRow, *WITH_FILES)
+            tables: tuple[type[OwnerRow | FileRow], ...] = (OwnerRow, *WITH_FILES)
             owners = {name for row in tables for name in session.scalars(select(row.owner).distinct())}
         return [self.usage(name, quota_mib) for name in sorted(owners)]
 

@@ -17,7 +17,7 @@ import time
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from sqlalchemy import Connection, inspect, text
 
@@ -220,7 +220,7 @@ def _numbers(revisions: Path) -> tuple[str, ...]:
 
 
 def _faults(connection: Connection) -> SchemaFaults:
-    inspector: Any = inspect(connection)
+    inspector = inspect(connection)
     there = set(inspector.get_table_names())
     tables, columns, indexes = [], [], []
     for table in Base.metadata.sorted_tables:

@@ -15,6 +15,7 @@ from sqlalchemy import (
     Double,
     Index,
     String,
+    TextClause,
     case,
     false,
     literal_column,
@@ -22,7 +23,9 @@ from sqlalchemy import (
 )
 from sqlalchemy.orm import DeclarativeBase, Mapped, MappedColumn, mapped_column
 
+from psfcore.fits.header import HeaderJson
 from workers.catalogue.database import Now
+from workers.contract.documents import PositionJson, TransitJson
 from workers.contract.jobs import Queue
 
 DEFAULT_OWNER = "local"
@@ -61,7 +64,7 @@ def _summed(table: str) -> Index:
     return Index(f"{table}_summed", "owner", "bytes")
 
 
-def _partial(name: str, condition: Any, *columns: str, unique: bool = False) -> Index:
+def _partial(name: str, condition: TextClause, *columns: str, unique: bool = False) -> Index:
     """An index of the rows that meet a condition."""
     return Index(name, *columns, unique=unique, sqlite_where=condition, postgresql_where=condition)
 
@@ -111,7 +114,7 @@ class RunColumns:
     created_at: Mapped[float]
     ended_at: Mapped[float | None]
     changed_at: Mapped[float] = _change_time()
-    error: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
+    error: Mapped[dict[str, str] | None] = mapped_column(JSON(none_as_null=True))
 
 
 class UploadColumns(OwnerColumns):
@@ -119,13 +122,14 @@ class UploadColumns(OwnerColumns):
 
     bytes: Mapped[int] = mapped_column(BigInteger)
     filename: Mapped[str | None]
-    summary: Mapped[dict[str, Any]]
 
 
 class ImageRow(UploadColumns, Base):
     """An uploaded image."""
 
     __tablename__ = "images"
+    summary: Mapped[HeaderJson] = mapped_column(JSON)
+
     __table_args__ = (_listed("images"), _summed("images"))
 
 
@@ -133,6 +137,8 @@ class TransitRow(UploadColumns, Base):
     """An uploaded transit: the archive, unchanged."""
 
     __tablename__ = "transits"
+    summary: Mapped[TransitJson] = mapped_column(JSON)
+
     __table_args__ = (_listed("transits"), _summed("transits"))
 
 
@@ -306,7 +312,7 @@ class JobRow(RunColumns, Base):
     count_step: Mapped[int] = mapped_column(default=0, server_default="0")
     result_id: Mapped[str | None] = mapped_column(String(64))
     # The estimate was made when the job was submitted.
-    estimate: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
+    estimate: Mapped[dict[str, float] | None] = mapped_column(JSON(none_as_null=True))
 
     __table_args__ = (
         # If two identical requests arrive at the same moment, the second insert fails; the request then finds the first
@@ -344,7 +350,8 @@ class BulkRow(RunColumns, Base):
 
     __tablename__ = "bulks"
     name: Mapped[str] = mapped_column(String(80))
-    request: Mapped[dict[str, Any]]  # without the ids of uploaded images; they are items of the run
+    # without the ids of uploaded images; they are items of the run
+    request: Mapped[dict[str, object]] = mapped_column(JSON)
     psf_id: Mapped[str | None] = mapped_column(String(64))
     context_id: Mapped[str | None] = mapped_column(String(64))
     running_since: Mapped[float | None]
@@ -354,7 +361,7 @@ class BulkRow(RunColumns, Base):
     )  # token of the lease of the worker that lists files
     # how far the files are listed (``workers.bulk.listing.SearchPosition``); null: the listing has not begun, or it has
     # no files
-    listed_to: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
+    listed_to: Mapped[PositionJson | None] = mapped_column(JSON(none_as_null=True))
     total: Mapped[int] = mapped_column(default=0)
     done: Mapped[int] = mapped_column(default=0)
     reused: Mapped[int] = mapped_column(default=0)  # done images whose product existed before
@@ -394,7 +401,7 @@ class BulkItemRow(Base):
     bytes: Mapped[int | None] = mapped_column(BigInteger)
     score: Mapped[float | None]  # artefact score
     statistics: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
-    error: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
+    error: Mapped[dict[str, str] | None] = mapped_column(JSON(none_as_null=True))
 
     __table_args__ = (
         Index("bulk_items_by_state", "bulk_id", "state", "position"),
@@ -452,7 +459,7 @@ class PartRow(Base):
     number: Mapped[int] = mapped_column(primary_key=True)
     token: Mapped[str | None] = mapped_column(String(32))
     heartbeat_at: Mapped[float | None]
-    result: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
+    result: Mapped[dict[str, object] | None] = mapped_column(JSON(none_as_null=True))
 
 
 class WorkerRow(Base):

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import time
 import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from sqlalchemy import delete, select
 from sqlalchemy.exc import IntegrityError
@@ -37,7 +36,7 @@ class UwsJobs:
     def __init__(self, database: Database, jobs: Jobs) -> None:
         self._database, self._jobs = database, jobs
 
-    def draft(self, kind: str, given: dict[str, Any], *, owner: str, **terms: Any) -> JobRow:
+    def draft(self, kind: str, given: Mapping[str, object], *, owner: str, **terms: object) -> JobRow:
         """Create a PENDING job with the parameters ``given`` so far. Identical requests do not share it.
 
         terms: the columns of its ``TermsRow``.
@@ -57,8 +56,8 @@ class UwsJobs:
             session.add_all((row, TermsRow(job_id=job_id, **terms)))
         return row
 
-    def amend(self, job_id: str, change: Callable[[dict[str, Any]], dict[str, Any]]) -> bool:
-        """Change the parameters of a PENDING job. In any other phase, nothing changes; returns False."""
+    def amend(self, job_id: str, change: Callable[[dict[str, str]], dict[str, str]]) -> bool:
+        """Change the parameters of a PENDING job (texts). In any other phase, nothing changes; returns False."""
         with self._database.writing.begin() as session:
             row = _locked(session, job_id)
             if row is None or row.phase != Phase.PENDING:
@@ -69,10 +68,10 @@ class UwsJobs:
     def start(
         self,
         job_id: str,
-        given: dict[str, Any],
-        parameters: dict[str, Any],
+        given: Mapping[str, object],
+        parameters: dict[str, object],
         request_key: str,
-        estimate: dict[str, Any] | None = None,
+        estimate: dict[str, float] | None = None,
     ) -> bool:
         """Queue a pending job with ``parameters``, which were resolved from ``given``.
 
@@ -107,7 +106,7 @@ class UwsJobs:
         """The UWS terms of a job: run id, time limit, destruction time."""
         return self._database.row(TermsRow, job_id) or TermsRow(job_id=job_id, execution_duration_s=0)
 
-    def set_terms(self, job_id: str, **values: Any) -> None:
+    def set_terms(self, job_id: str, **values: object) -> None:
         """Change UWS terms of a job."""
         with self._database.writing.begin() as session:
             # The lock on the job's row puts changes in order. Terms are not added to a deleted job.
@@ -144,7 +143,10 @@ class UwsJobs:
             query = query.where(JobRow.phase.in_(phases))
         if from_time is not None:
             query = query.where(JobRow.created_at >= from_time)
-        return [JobLine(*line) for line in self._database.lines(newest_first(query, JobRow, last))]
+        return [
+            JobLine(*line)
+            for line in self._database.lines(newest_first(query, (JobRow.created_at, JobRow.id), last))
+        ]
 
 
 def _locked(session: Session, job_id: str) -> JobRow | None:

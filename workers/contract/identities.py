@@ -48,7 +48,7 @@ def build_for(instrument: str, turn_deg: float) -> PsfBuild:
     return PsfBuild(instrument=instrument)
 
 
-def diffraction_build(transit: Mapping[str, Any], noise: NoiseFigures | None) -> PsfBuild | None:
+def diffraction_build(transit: Mapping[str, object], noise: NoiseFigures | None) -> PsfBuild | None:
     """The build of the diffraction PSF of a transit; None if the transit contains this PSF.
 
     transit: the entries "noise", "known_psf" and "instrument" of its manifest. noise: of the request. Raises DataError
@@ -57,16 +57,17 @@ def diffraction_build(transit: Mapping[str, Any], noise: NoiseFigures | None) ->
     check_noise(transit, noise)
     if transit["known_psf"] is not None:
         return None
-    if transit["instrument"] not in instrument_names():
+    instrument = transit["instrument"]
+    if not isinstance(instrument, str) or instrument not in instrument_names():
         raise DataError(
             "no-known-psf",
             f"expected known_psf in transit.json, or one of the instruments {', '.join(instrument_names())}; "
-            f"got neither ({transit['instrument']!r})",
+            f"got neither ({instrument!r})",
         )
-    return PsfBuild(instrument=transit["instrument"], component="diffraction")
+    return PsfBuild(instrument=instrument, component="diffraction")
 
 
-def check_noise(transit: Mapping[str, Any], noise: NoiseFigures | None) -> None:
+def check_noise(transit: Mapping[str, object], noise: NoiseFigures | None) -> None:
     """Raise DataError "no-noise-figures" if neither the transit nor the request has noise figures."""
     if noise is None and transit["noise"] is None:
         raise DataError(

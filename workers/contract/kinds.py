@@ -45,8 +45,8 @@ from workers.contract.requests import (
 )
 from workers.versions import INTERPOLATED
 
-Task = Callable[[Any, Mapping[str, Any]], str]
-Assistant = Callable[[Any, Mapping[str, Any]], None]
+Task = Callable[[Any, Mapping[str, object]], str]
+Assistant = Callable[[Any, Mapping[str, object]], None]
 
 
 class ResultType(StrEnum):

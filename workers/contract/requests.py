@@ -449,7 +449,7 @@ class ResolvedRerun(Rerun):
     """A rerun with the kind and the parameters of the job that made the product or PSF."""
 
     kind: str
-    parameters: dict[str, Any]
+    parameters: dict[str, object]
 
 
 # Jobs on an uploaded transit.

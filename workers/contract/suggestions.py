@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from types import UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from typing import Annotated, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic_core import ErrorDetails
@@ -14,7 +14,7 @@ from psfcore.errors import did_you_mean as did_you_mean
 SHOWN = 60
 
 
-def explained(errors: Iterable[ErrorDetails], model: Any) -> Iterator[tuple[ErrorDetails, str]]:
+def explained(errors: Iterable[ErrorDetails], model: object) -> Iterator[tuple[ErrorDetails, str]]:
     """Each validation error with its message. The message of an error about an unknown name lists the known names.
 
     model: the type that was validated. The locations of the errors are relative to it.
@@ -23,7 +23,7 @@ def explained(errors: Iterable[ErrorDetails], model: Any) -> Iterator[tuple[Erro
         yield error, _message(error, model)
 
 
-def _message(error: ErrorDetails, model: Any) -> str:
+def _message(error: ErrorDetails, model: object) -> str:
     if error["type"] == "extra_forbidden":
         name, known = str(error["loc"][-1]), _fields(_at(model, error["loc"][:-1]))
         return f"there is no such field; expected one of {', '.join(known)}{did_you_mean(name, known)}"
@@ -38,7 +38,7 @@ def _message(error: ErrorDetails, model: Any) -> str:
     return error["msg"]
 
 
-def _members(kind: Any) -> list[type[BaseModel]]:
+def _members(kind: object) -> list[type[BaseModel]]:
     """The models that a type allows."""
     if isinstance(kind, type) and issubclass(kind, BaseModel):
         return [kind]
@@ -49,7 +49,7 @@ def _members(kind: Any) -> list[type[BaseModel]]:
     return []
 
 
-def _at(kind: Any, location: Iterable[str | int]) -> Any:
+def _at(kind: object, location: Iterable[str | int]) -> object:
     """The type at a location. A location consists of field names, list indices, and the tags that select a member of a
     union.
     """
@@ -66,14 +66,14 @@ def _at(kind: Any, location: Iterable[str | int]) -> Any:
     return kind
 
 
-def _literals(model: type[BaseModel], name: str) -> tuple[Any, ...]:
+def _literals(model: type[BaseModel], name: str) -> tuple[object, ...]:
     kind = model.model_fields[name].annotation if name in model.model_fields else None
     return get_args(kind) if get_origin(kind) is Literal else ()
 
 
-def _fields(kind: Any) -> list[str]:
+def _fields(kind: object) -> list[str]:
     return list(dict.fromkeys(name for model in _members(kind) for name in model.model_fields))
 
 
-def _tags(kind: Any, key: str) -> list[str]:
+def _tags(kind: object, key: str) -> list[str]:
     return [str(tag) for model in _members(kind) for tag in _literals(model, key)]

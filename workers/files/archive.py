@@ -278,7 +278,7 @@ def _met(value: str | float | bool | None, condition: Condition) -> bool:
     return _same(value, condition)
 
 
-def _same(value: Any, other: Any) -> bool:
+def _same(value: object, other: object) -> bool:
     return isinstance(value, bool) == isinstance(other, bool) and bool(value == other)
 
 

@@ -10,14 +10,13 @@ still uses the PSFs that it pins, even if they were deprecated later. So its res
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from psfcore.errors import DataError
 from psfcore.fits.channel import PsfOrigin, binning_factor, check_channel
 from psfcore.fits.frame import plate_scale_arcsec
-from psfcore.fits.header import origin_of, wavelength_angstrom
+from psfcore.fits.header import HeaderJson, origin_of, wavelength_angstrom
 from psfcore.instruments.model import load_instrument
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ProductRow, PsfRow
@@ -28,7 +27,7 @@ DEPRECATED_CODE = "psf-deprecated"  # the code of the error and of the warning
 SHOWN_DIGITS = 12
 
 
-def check(request: ResolvedDeconvolve, psf: PsfRow | None, header: Mapping[str, Any]) -> None:
+def check(request: ResolvedDeconvolve, psf: PsfRow | None, header: HeaderJson) -> None:
     """Raise the errors that the job would raise for the headers of its image and its PSF.
 
     psf: the row of the PSF; None: the PSF is not built yet. header: the header summary that is stored with the image.
@@ -41,7 +40,7 @@ def check(request: ResolvedDeconvolve, psf: PsfRow | None, header: Mapping[str, 
         binning_factor(origin, cards)
 
 
-def suits(psf: PsfRow | str, header: Mapping[str, Any]) -> bool:
+def suits(psf: PsfRow | str, header: HeaderJson) -> bool:
     """Whether the channel and the pixels of an image fit a PSF. psf: its row, or the name of its instrument. header: as
     in ``check``.
     """

@@ -71,7 +71,7 @@ class Estimate:
 
 def checked(
     kind: str, parameters: Mapping[str, Any], catalogue: Catalogue, owner: str, settings: Settings
-) -> dict[str, Any]:
+) -> dict[str, float]:
     """The estimate of a job with these resolved parameters, as JSON.
 
     Raises DataError "too-much-memory" or "too-much-time" if it exceeds the operator's limits.

@@ -10,14 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 from pydantic import BaseModel, Field
 
 from psfcore.errors import DataError
+from psfcore.fits.header import HeaderJson
 from psfcore.instruments.model import load_instrument
 from psfcore.instruments.psf_statements import version_text
-from psfcore.instruments.unknown import agreement, unknown_instrument
+from psfcore.instruments.unknown import SuitedPsf, agreement, unknown_instrument
 from psfcore.instruments.unknown import channel_of as channel_of_image
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.contexts import NOW, Ends
@@ -134,7 +134,7 @@ def _look(catalogue: Catalogue, wanted: PsfFilter, owner: str, pinned: PsfContex
 
 
 def look_for_image(
-    catalogue: Catalogue, header: Mapping[str, Any], owner: str, context: str | None, kind: str = TOTAL
+    catalogue: Catalogue, header: HeaderJson, owner: str, context: str | None, kind: str = TOTAL
 ) -> SearchResult:
     """The PSFs for the instrument, channel and time of an image. header: the header summary that is stored with the
     upload.
@@ -153,7 +153,7 @@ def look_for_image(
 
 
 def _look_at_time_of(
-    header: Mapping[str, Any],
+    header: HeaderJson,
     wanted: PsfFilter,
     catalogue: Catalogue,
     owner: str,
@@ -180,7 +180,7 @@ def _look_at_time_of(
 
 
 def picked_for_image(
-    catalogue: Catalogue, header: Mapping[str, Any], owner: str, context: str | None
+    catalogue: Catalogue, header: HeaderJson, owner: str, context: str | None
 ) -> SearchResult | None:
     """Find the PSF for an image if the request names no PSF; None if the series of the image has no certified PSF.
 
@@ -203,14 +203,14 @@ def picked_for_image(
     return _look_at_time_of(header, wanted, catalogue, owner, pinned) if certified else None
 
 
-def seen_through(header: Mapping[str, Any]) -> tuple[str | None, str | None]:
+def seen_through(header: HeaderJson) -> tuple[str | None, str | None]:
     """The instrument and the channel of an image. header: the header summary that is stored with the upload."""
     instrument = instrument_of(header)
     return instrument, channel_of(instrument, header["wavelnth"])
 
 
 def _seen_as(
-    catalogue: Catalogue, header: Mapping[str, Any], owner: str, pinned: PsfContextRow | None, kind: str
+    catalogue: Catalogue, header: HeaderJson, owner: str, pinned: PsfContextRow | None, kind: str
 ) -> tuple[str | None, str | None]:
     """The instrument and the channel of an image, with the variant of the channel to which the image belongs, if any.
 
@@ -302,7 +302,7 @@ def _why_built(wanted: Deconvolve, catalogue: Catalogue, owner: str) -> str:
     )
 
 
-def no_psf(catalogue: Catalogue, header: Mapping[str, Any], owner: str) -> DataError:
+def no_psf(catalogue: Catalogue, header: HeaderJson, owner: str) -> DataError:
     """The error "no-psf-for-instrument" for an image with this header summary.
 
     The error has these fields: `image` is the name of the telescope. `instruments` are the instruments whose PSF can
@@ -313,7 +313,7 @@ def no_psf(catalogue: Catalogue, header: Mapping[str, Any], owner: str) -> DataE
     return unknown_instrument(header, list(_candidates(catalogue, header, owner)))
 
 
-def _candidates(catalogue: Catalogue, header: Mapping[str, Any], owner: str) -> Iterator[dict[str, Any]]:
+def _candidates(catalogue: Catalogue, header: HeaderJson, owner: str) -> Iterator[SuitedPsf]:
     """At most MOST_NAMED PSFs of the same telescope or plate scale, newest first.
 
     PSFs of other channels are left out.

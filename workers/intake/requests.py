@@ -8,11 +8,12 @@ from typing import Any
 
 from psfcore.deconvolve.box import Box
 from psfcore.fits.frame import frame_of
-from psfcore.fits.header import check_not_deconvolved
+from psfcore.fits.header import HeaderJson, check_not_deconvolved
 from psfcore.gap.effect_sources import sha256_of_source
 from psfcore.instruments.workload import check_workload
 from workers.catalogue.catalogue import Catalogue, Row
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, TransitRow
+from workers.contract.documents import TransitJson
 from workers.contract.identities import (
     build_for,
     canonical_hash,
@@ -141,7 +142,7 @@ def resolve_deconvolve(submission: Submission) -> Parameters:
 
 
 def resolved_deconvolution(
-    wanted: Deconvolve, header: dict[str, Any], catalogue: Catalogue, owner: str
+    wanted: Deconvolve, header: HeaderJson, catalogue: Catalogue, owner: str
 ) -> ResolvedDeconvolve:
     """The resolved deconvolution of an image with this header, with its PSF. Raises the same ``DataError`` as
     ``resolve``.
@@ -162,7 +163,7 @@ def resolved_deconvolution(
 _TABLES: dict[str, Any] = {"image": ImageRow, "psf": PsfRow, "transit": TransitRow}
 
 
-def _diffraction_of(submission: Submission, summary: dict[str, Any]) -> PsfBuild | None:
+def _diffraction_of(submission: Submission, summary: TransitJson) -> PsfBuild | None:
     """The recipe of the diffraction PSF of a transit; None if the transit contains this PSF."""
     recipe = diffraction_build(summary, submission.parameters.noise)
     if recipe is None:
@@ -179,7 +180,7 @@ def _diffraction_of(submission: Submission, summary: dict[str, Any]) -> PsfBuild
     return recipe
 
 
-def _psf_for(catalogue: Catalogue, header: dict[str, Any], wanted: Deconvolve, owner: str) -> dict[str, Any]:
+def _psf_for(catalogue: Catalogue, header: HeaderJson, wanted: Deconvolve, owner: str) -> dict[str, Any]:
     """The PSF that the request names; else the certified PSF that fits the image, or the PSF that is interpolated
     between two certified PSFs; else the PSF that is built for the instrument.
     """

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import NamedTuple
 
-from psfcore.fits.header import HeaderSummary
+from psfcore.fits.header import HeaderJson, HeaderSummary
 from psfcore.transit.archive import ArchiveContents
 from workers.catalogue.tables import ImageRow, PsfRow, TransitRow
+from workers.contract.documents import header_json
 from workers.versions import UPLOADED, PsfStatus, channel_of, instrument_of, label, name_of_upload, series_of
 
 TEXT_LENGTH = 200
@@ -103,13 +105,13 @@ def uploaded_psf_row(
     )
 
 
-def _summary(summary: HeaderSummary) -> dict[str, Any]:
+def _summary(summary: HeaderSummary) -> HeaderJson:
     """The summary of a header as JSON. Each text is cut, because one text may continue over thousands of cards."""
-    return _cut(dataclasses.asdict(summary))
+    return header_json(_cut(dataclasses.asdict(summary)))
 
 
-def _cut(values: dict[str, Any]) -> dict[str, Any]:
-    found = {
+def _cut(values: Mapping[str, object]) -> dict[str, object]:
+    cut = {
         name: label(value, TEXT_LENGTH) if isinstance(value, str) else value for name, value in values.items()
     }
-    return found | {name: _cut(value) for name, value in values.items() if isinstance(value, dict)}
+    return cut | {name: _cut(value) for name, value in values.items() if isinstance(value, dict)}

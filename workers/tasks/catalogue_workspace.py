@@ -229,7 +229,7 @@ class CatalogueWorkspace(Workspace):
             file_sha256, size_bytes = self.write(write)
         if draw is not None:
             preview = (self.write(draw) if drawn is None else drawn.result())[0]
-        entries: dict[str, Any] = {ENTRIES[name]: self.write(write)[0] for name, write in files.items()}
+        entries: dict[str, object] = {ENTRIES[name]: self.write(write)[0] for name, write in files.items()}
         figures = [self.write(partial(Path.write_bytes, data=png))[0] for png in result.figures()]
         if figures:
             entries["figures_sha256"] = figures

@@ -8,7 +8,7 @@ folds that no other worker takes, so the job does not depend on help.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -77,7 +77,7 @@ def cross_validate(workspace: Workspace, request: ResolvedCrossValidate, identit
     )
 
 
-def assist_cross_validation(workspace: CatalogueWorkspace, parameters: Mapping[str, Any]) -> None:
+def assist_cross_validation(workspace: CatalogueWorkspace, parameters: Mapping[str, object]) -> None:
     """Compute folds of a job that another worker runs, until no fold is left."""
     request = ResolvedCrossValidate.model_validate(parameters)
     identity = psf_fit_identity(request)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 from astropy.io.fits import Header
 
@@ -86,7 +85,7 @@ def product_result(
     request: ResolvedDeconvolve,
     product: Product,
     psf: UsedPsf,
-    details: Mapping[str, Any],
+    details: Mapping[str, object],
     *,
     job_id: str,
     preview: bool = True,

@@ -121,7 +121,7 @@ def _short(hashes: tuple[str, ...]) -> str:
 
 def _provenance(
     request: ResolvedGapDiagnose, parent: Psf | None, added: tuple[Added, ...], job_id: str
-) -> dict[str, Any]:
+) -> dict[str, object]:
     started = (
         None if parent is None else {"name": parent.name, "version": parent.version, "id": request.psf_id}
     )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from datetime import datetime
-from typing import Any
 
 import numpy as np
 
@@ -75,7 +74,7 @@ def _epoch(workspace: CatalogueWorkspace, psf_id: str, time: str) -> Epoch:
     return Epoch(psf, datetime.fromisoformat(time), {"psf_id": row.id, "file_sha256": row.file_sha256})
 
 
-def _fit_of(psf: Psf, threads: int) -> dict[str, Any]:
+def _fit_of(psf: Psf, threads: int) -> dict[str, object]:
     """The parameters and the curve with their errors, in the form of the details of a fitted PSF."""
     assert psf.fitted is not None
     radii = np.array([radius for radius in CURVE_RADII_PX if radius < psf.kernel.shape[0] // 2])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
-from typing import Any
 
 from psfcore.errors import module_of_extra
 from workers.catalogue.tables import PsfRow
@@ -13,7 +12,7 @@ from workers.tasks.catalogue_workspace import CatalogueWorkspace
 from workers.tasks.results import write_tables
 
 
-def psf_tables(workspace: CatalogueWorkspace, parameters: Mapping[str, Any]) -> str:
+def psf_tables(workspace: CatalogueWorkspace, parameters: Mapping[str, object]) -> str:
     """Make the tables of a PSF of the catalogue, and its picture if it is missing; returns the PSF's id."""
     row = workspace.row(PsfRow, PsfTables.model_validate(parameters).psf_id)
     workspace.report("reading", 0, 3)

@@ -53,14 +53,14 @@ class RerunWorkspace(CatalogueWorkspace):
         return self.rows[-1]
 
 
-def rerun(workspace: CatalogueWorkspace, parameters: Mapping[str, Any]) -> str:
+def rerun(workspace: CatalogueWorkspace, parameters: Mapping[str, object]) -> str:
     """Make a product or a PSF again, and compare it with the first one; returns the report's id."""
     request = ResolvedRerun.model_validate(parameters)
     identity = rerun_identity(request, workspace.job_id)
     if workspace.has(ResultType.REPORT, identity):
         return identity
-    table: Any = PsfRow if request.of == "psf" else ProductRow
-    first: Thing = workspace.row(table, request.id)
+    of_psf = request.of == "psf"
+    first = workspace.row(PsfRow, request.id) if of_psf else workspace.row(ProductRow, request.id)
     again = _made_again(workspace, request, first)
     _save(workspace, identity, request, first, again)
     return identity
@@ -101,7 +101,7 @@ def _instrument_text(workspace: CatalogueWorkspace, first: Thing) -> str:
     return text
 
 
-def _arrays(workspace: CatalogueWorkspace, row: Thing) -> dict[str, NDArray[Any]]:
+def _arrays(workspace: CatalogueWorkspace, row: Thing) -> dict[str, NDArray[np.generic]]:
     """The image arrays of a product or PSF file, by name."""
     if isinstance(row, PsfRow):
         psf = workspace.psf_of(row)
@@ -139,7 +139,7 @@ def _save(
     workspace.add(report_result(identity, KIND, said, details, about_id=request.id))
 
 
-def _made(workspace: CatalogueWorkspace, row: Thing) -> dict[str, Any]:
+def _made(workspace: CatalogueWorkspace, row: Thing) -> dict[str, object]:
     made = lineage(workspace.catalogue, row).made
     assert isinstance(made, Creation)
     return made.model_dump(mode="json", exclude={"parameters"})

@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Mapping
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from psfcore.errors import module_of_extra
 from psfcore.fits.psfs import write_psf
@@ -28,13 +28,13 @@ def psf_result(
     identity: str,
     *,
     origin: str,
-    details: Mapping[str, Any],
+    details: Mapping[str, object],
     threads: int,
     draw: Write | None = None,
     kind: str = TOTAL,
     channel: str | None = None,
     write: Write | None = None,
-    report: Mapping[str, Any] | None = None,
+    report: Mapping[str, object] | None = None,
 ) -> Result:
     """A draft PSF.
 
@@ -86,8 +86,8 @@ def write_tables(path: Path, *, psf: Psf, threads: int) -> None:
 def report_result(
     identity: str,
     kind: str,
-    content: Mapping[str, Any],
-    details: Mapping[str, Any],
+    content: Mapping[str, object],
+    details: Mapping[str, object],
     *,
     draw: Write | None = None,
     page: Callable[[], Page] | None = None,
@@ -110,7 +110,7 @@ def report_result(
     return Result(ResultType.REPORT, identity, details, files, columns, lambda: drawn().figures)
 
 
-def provenance_of(job_id: str, request: Parameters) -> dict[str, Any]:
+def provenance_of(job_id: str, request: Parameters) -> dict[str, object]:
     """The inputs, parameters and software versions with which a job makes its result. request: the resolved
     parameters.
     """
@@ -125,6 +125,6 @@ def provenance_of(job_id: str, request: Parameters) -> dict[str, Any]:
     }
 
 
-def write_json(path: Path, content: Mapping[str, Any]) -> None:
+def write_json(path: Path, content: Mapping[str, object]) -> None:
     """Write indented JSON. Raises ValueError for NaN and infinity, which JSON does not have."""
     path.write_text(json.dumps(content, indent=1, allow_nan=False), "utf-8")

@@ -21,6 +21,7 @@ from workers.settings import Settings
 from workers.stage_timer import StageTimer
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
 
     from psfcore.deconvolve.run import PsfSource
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from psfcore.scatter.inversion import Inverter
 
 Progress = Callable[[str, int, int], None]
-Json = dict[str, Any]
+Json = dict[str, object]
 PARTS = "folds"  # the stage of the parts of a job
 
 
@@ -66,7 +67,7 @@ def task_of(kind: str) -> Callable[[Callable[[Any, Any, str], None]], Task]:
 
     def task_from(add: Callable[[Any, Any, str], None]) -> Task:
         @wraps(add)
-        def task(workspace: Workspace, parameters: Mapping[str, Any]) -> str:
+        def task(workspace: Workspace, parameters: Mapping[str, object]) -> str:
             assert row.resolved is not None and row.identity is not None
             request = row.resolved.model_validate(parameters)
             identity = row.identity(request)
@@ -130,7 +131,7 @@ class Workspace(ABC):
         """The PSF with this id; parts: whether with its components and errors. Raises DataError "no-such-psf"."""
 
     def build(
-        self, recipe: Recipe, mount_image: NDArray[Any] | None, progress: Callable[[int, int], None]
+        self, recipe: Recipe, mount_image: NDArray[np.floating] | None, progress: Callable[[int, int], None]
     ) -> tuple[Psf, Callable[[Path], object]]:
         """The PSF of a recipe, and a function that writes its file. mount_image: the pixels of the mask image of its
         mount, if it has one.

@@ -9,6 +9,7 @@ import pkgutil
 from collections.abc import Callable
 from functools import cache
 from importlib import import_module
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, cast
 
 import psfcore.deconvolve.methods
@@ -57,7 +58,7 @@ def method_names() -> list[str]:
 
 
 @cache
-def _modules() -> dict[str, Any]:
+def _modules() -> dict[str, ModuleType]:
     package = psfcore.deconvolve.methods
     files = [
         import_module(f"{package.__name__}.{one.name}") for one in pkgutil.iter_modules(package.__path__)

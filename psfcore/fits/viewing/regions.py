@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, BinaryIO, Literal
+from typing import BinaryIO, Literal
 
 import numpy as np
 from astropy.io import fits
@@ -161,6 +161,6 @@ def moved_header(whole: fits.Header, columns: slice, rows: slice) -> fits.Header
     return header
 
 
-def _cut(hdu: fits.ImageHDU, columns: slice, rows: slice) -> Any:
+def _cut(hdu: fits.ImageHDU, columns: slice, rows: slice) -> fits.ImageHDU:
     make = fits.PrimaryHDU if isinstance(hdu, fits.PrimaryHDU) else fits.ImageHDU
     return make(np.asarray(hdu.section[rows, columns]), moved_header(hdu.header, columns, rows))

@@ -267,7 +267,7 @@ class UnoccultedSize:
     noise_pct: float
     shows_the_gap: bool
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """The size as JSON, for the gap report."""
         return {
             "residual": self.before,

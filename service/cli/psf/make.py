@@ -45,7 +45,9 @@ def build(
     instrument: str,
     output: Path,
     plot: Path | None,
-    **parameters: Any,
+    size: int,
+    component: str | None,
+    overwrite: bool,
 ) -> None:
     """Compute the PSF of an instrument."""
     with (
@@ -57,9 +59,11 @@ def build(
             instrument,
             output,
             mask=_mask_of(instrument, folder),
+            size=size,
+            component=component,
             preview=plot,
             progress=report,
-            **parameters,
+            overwrite=overwrite,
         )
     echo(f"{output}: {title(built['name'], built['version'], built['status'])}, id {short(built['id'])}")
     for radius, beyond_pct in built["details"]["cumulative_curve_pct"].items():
@@ -82,7 +86,7 @@ def fit(
     output: Path,
     json_file: Path | None,
     plot: Path | None,
-    **parameters: Any,
+    **parameters: object,
 ) -> None:
     """Fit the scattered light in TRANSIT: a folder with a transit.json, or a .zip or .tar file of such a folder."""
     with connection() as service, progress_bar() as say:
@@ -126,7 +130,7 @@ def crossval(
     transit: Path,
     json_file: Path,
     plot: Path | None,
-    **parameters: Any,
+    **parameters: object,
 ) -> None:
     """Estimate the uncertainty of the fit to TRANSIT: hold out blocks of images and bootstrap the other images, in many
     runs.

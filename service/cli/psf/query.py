@@ -66,14 +66,18 @@ def list_published() -> None:
 
 
 @click.command("get")
-@NAMES
+@click.argument("names", metavar="[NAME]...", nargs=-1)
 @SOURCE
-def get_psfs(names: tuple[str, ...], source: Path | None) -> None:
-    """Bring published PSFs, whose names then stand for them: `heliopsf deconvolve --psf NAME`.
+@click.pass_context
+def get_psfs(ctx: click.Context, names: tuple[str, ...], source: Path | None) -> None:
+    """Bring published PSFs, whose names then stand for them: `heliopsf deconvolve --psf NAME`. Without a name: list
+    them.
 
     A broken download is tried again; it is kept only if it has the published checksum. HELIOPSF_CACHE_DIR names the
     folder that keeps them; several machines may share it.
     """
+    if not names:
+        ctx.invoke(list_published)
     for name in names:
         brought(name, source)
         echo(f"next: `heliopsf deconvolve IMAGE --psf {name} --local -o PRODUCT.fits`")

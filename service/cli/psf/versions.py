@@ -7,7 +7,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypedDict, cast
+from typing import TYPE_CHECKING, Literal, TypedDict, cast
 
 import click
 
@@ -164,10 +164,12 @@ def upload_psf(service: Client, file: Path, **description: str | None) -> None:
 @REASON
 @_series_options
 @on_service
-def certify(service: Client, psf_id: str, supersedes: tuple[str, ...], **change: Any) -> None:
+def certify(
+    service: Client, psf_id: str, supersedes: tuple[str, ...], reason: str, **change: str | None
+) -> None:
     """Certify a PSF for a range of times of observation, or change the range of a certified PSF."""
     superseded = [whole_id(service, "psfs", identity) for identity in supersedes]
-    now = service.certify_psf(psf_id, supersedes=superseded, **change)
+    now = service.certify_psf(psf_id, supersedes=superseded, reason=reason, **change)
     echo(f"{now['series']} {now['version']}: {now['status']}{_validity(now)}")
 
 
@@ -205,7 +207,7 @@ def delete_psf(service: Client, psf_id: str) -> None:
 @on_service
 @writes_files
 def best(
-    service: Client, image: Path | None, json_file: Path | None, overwrite: bool, **filters: Any
+    service: Client, image: Path | None, json_file: Path | None, overwrite: bool, **filters: str | None
 ) -> None:
     """With --image, show the PSF that `heliopsf deconvolve` would use for the image, and why. Without it, find the PSF
     with the given properties. With --image and a --kind other than total, only certified PSFs or the PSFs of a context

@@ -9,7 +9,9 @@ from psfcore.instruments.psf_statements import (
     caveats,
     curves_once,
     mesh_is_assumed,
+    offer,
     published_text,
+    published_with_scatter,
     remarks,
     scatter_left,
     title,
@@ -47,6 +49,14 @@ def test_other_psfs_say_what_their_provenance_does() -> None:
     assert assumptions("hri_euv", "hri_euv", changed) == ["mesh of the filter assumed"]
     assert mesh_is_assumed("hri_euv", "hri_euv", changed)
     assert len(remarks("mine", None, {}, "draft")) == 1 and remarks("mine", None, {}, "certified") == []
+
+
+def test_a_published_psf_with_the_scatter_that_stays_is_offered() -> None:
+    assert published_with_scatter("aia_171", "aia_171", {}) == ["aia_171_2025"]
+    assert "`heliopsf psf get aia_171_2025`" in offer(["aia_171_2025"])
+    for name in ("hri_euv", "trace_171", "mine"):
+        assert published_with_scatter(name, name, {}) == [], name
+    assert published_with_scatter("aia_171_2025", "aia_171", {}) == [], "it contains the scatter"
 
 
 def test_title_and_version() -> None:

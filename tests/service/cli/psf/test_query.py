@@ -68,6 +68,25 @@ def test_get_deconvolve_and_header_with_the_doi(image: Path, tmp_path: Path) -> 
     )
 
 
+def test_published_means_the_published_psf_of_the_image(image: Path, tmp_path: Path) -> None:
+    asked = ("deconvolve", image, "--psf", "published", "--local", "--steps", 2, "-o", tmp_path / "o.fits")
+    assert f"`heliopsf psf get {NAME}`" in local(*asked, code=1), "it is not there yet"
+    assert f"  {NAME} " in local("psf", "get"), "without a name: the list"
+    with stand_in("/psf"):
+        local("psf", "get", NAME)
+    local(*asked)
+    header = fits.getheader(tmp_path / "o.fits")
+    assert header["PSFNAME"] == NAME
+    same = heliopsf.deconvolve(fits.open(image), "published", steps=2)
+    assert same[0].header["PSFID"] == header["PSFID"]
+    write_image(tmp_path / "1600.fits", TELESCOP="SDO/AIA", WAVELNTH=1600)
+    with pytest.raises(DataError, match="no-published-psf"):
+        heliopsf.deconvolve(tmp_path / "1600.fits", "published")
+    write_image(tmp_path / "xrt.fits", TELESCOP="HINODE", INSTRUME="XRT")
+    with pytest.raises(DataError, match=r"no-published-psf.*xrt_560ev_2017, xrt_1kev_2017"):
+        heliopsf.deconvolve(tmp_path / "xrt.fits", "published")
+
+
 def test_an_operator_adds_a_psf_for_all_and_its_citation_is_in_the_lineage(
     image: Path,
     tmp_path: Path,
