@@ -4,7 +4,6 @@ compared.
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable
 from typing import Annotated, TypeVar, get_args
 
@@ -15,7 +14,6 @@ from starlette.datastructures import FormData
 
 from psfcore.errors import DataError
 from psfcore.instruments.files import instrument_names, parse_toml, telescope_of
-from psfcore.instruments.psf_statements import curves_once
 from psfcore.tables import lookup
 from service.api.images import get_psf_lineage, rerun_psf
 from service.api.pixels import picture_of
@@ -126,8 +124,8 @@ def psf(psf_id: Identity, request: Request, caller: PageReading, state: Shared) 
         facts=psf_facts(view),
         status_view=status,
         series=_series(state, caller, status.series),
-        profile=None if tables is None else _once(lookup.profile(tables), "mean_weight"),
-        curve=None if tables is None else _once(lookup.curve(tables), "light_beyond_pct"),
+        profile=None if tables is None else lookup.profile(tables),
+        curve=None if tables is None else lookup.curve(tables),
         no_tables=told,
         fit=None if report_sha256 is None else json_of(state.store, report_sha256),
         lineage=get_psf_lineage(psf_id, caller, state),
@@ -199,14 +197,6 @@ def delete(psf_id: Identity, caller: PageSubmitting, state: Shared) -> Response:
     """Delete a draft that nothing uses, and go to the list."""
     delete_psf(psf_id, caller, state)
     return RedirectResponse("/psfs", 303)
-
-
-def _once(answer: dict[str, Any], curves: str) -> dict[str, Any]:
-    """An answer of the tables with each of its curves once. A component with the errors of a fit differs from the
-    others.
-    """
-    once = curves_once(answer[curves], operator.eq)
-    return answer | {curves: {", ".join(names): numbers for names, numbers in once.items()}}
 
 
 def psf_facts(psf: PsfView) -> list[tuple[str, str]]:

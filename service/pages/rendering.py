@@ -9,6 +9,7 @@ of them.
 
 from __future__ import annotations
 
+import operator
 import re
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
@@ -20,6 +21,7 @@ from fastapi.responses import HTMLResponse
 from jinja2 import DictLoader, Environment, StrictUndefined
 from markupsafe import Markup
 
+from psfcore.instruments.psf_statements import curves_once
 from service.http.callers import Caller
 from service.http.state import state_of
 from service.pages import assets
@@ -93,6 +95,11 @@ def page(
     return HTMLResponse(text, status_code=status, headers=said)
 
 
+def once(curves: Mapping[str, Sequence[float]]) -> dict[str, Sequence[float]]:
+    """Each curve of a PSF once, with all its names."""
+    return {", ".join(names): numbers for names, numbers in curves_once(curves, operator.eq).items()}
+
+
 def templates() -> dict[str, str]:
     """The sources of all templates, by their names. A file holds those of one subject; the line {# --- NAME --- #}
     begins each.
@@ -126,6 +133,7 @@ def _environment() -> Environment:
         "short": short,
         "date": date,
         "dense": dense,
+        "once": once,
         "differing": differing,
         "size": size,
         "duration": duration,

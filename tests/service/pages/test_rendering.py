@@ -28,6 +28,7 @@ from service.pages.rendering import (
     differing,
     duration,
     number,
+    once,
     percent,
     size,
 )
@@ -244,3 +245,8 @@ def test_only_what_differs_is_listed() -> None:
     again = {"name": "a", "libraries": {"numpy": "3", "scipy": "2"}, "mirrors": [{"name": "m1"}], "id": "x"}
     changed = [("libraries.numpy", "1", "3"), ("mirrors m1.mm", "1", "-"), ("id", "-", "x")]
     assert differing(first, again) == changed and differing(first, first) == []
+
+
+def test_curves_of_a_psf_that_coincide_are_one_column() -> None:
+    curves = {"TOTAL": [1.0, 0.5], "AIRY": [1.0, 0.2], "DIFFRACTION": [1.0, 0.5]}
+    assert once(curves) == {"AIRY": [1.0, 0.2], "TOTAL, DIFFRACTION": [1.0, 0.5]}
