@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from enum import IntFlag
 from functools import partial
 from typing import TypeVar
@@ -255,8 +255,16 @@ def _structures(blocks: _Blocks) -> list[Structure]:
     low, high = blocks.old_levels[max(blocks.tails)]
     tails = (blocks.old <= low) | (blocks.old >= high)
     old, new = blocks.old[tails], blocks.new[tails]
-    rows = (_structure(blocks, old, new, kind, tail) for tail in blocks.tails for kind in ("bright", "dark"))
-    return [row for row in rows if row is not None]
+    rows = []
+    of_level: dict[tuple[str, float], Structure | None] = {}  # on a plateau, all tails have the same level
+    for tail, kind in ((tail, kind) for tail in blocks.tails for kind in ("bright", "dark")):
+        level = blocks.old_levels[tail][kind == "bright"]
+        if (kind, level) not in of_level:
+            of_level[kind, level] = _structure(blocks, old, new, kind, tail)
+        row = of_level[kind, level]
+        if row is not None:
+            rows.append(replace(row, tail_pct=tail))
+    return rows
 
 
 def _structure(blocks: _Blocks, old: Means, new: Means, kind: str, tail: float) -> Structure | None:
