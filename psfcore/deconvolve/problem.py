@@ -234,6 +234,7 @@ def first_estimate(problem: Problem) -> NDArray[np.float32]:
         gathered = _convolved(engine, lambda rows: np.where(trusted[rows], domain.pixels[rows], zero))
         for rows, light in gathered:
             np.copyto(estimate[rows], light, where=missing[rows])
+            del light  # it is a view of the plane, which is not needed any more
         for rows, near in _convolved(engine, lambda rows: trusted[rows].astype(np.float32)):
             mean = estimate[rows] / np.maximum(near, _ENOUGH_NEIGHBOURS)
             known = np.where(near > _ENOUGH_NEIGHBOURS, mean, everywhere)
