@@ -18,6 +18,7 @@ of the light may come from beyond the field, which the model does not contain.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple, get_args
 
@@ -228,14 +229,31 @@ def first_estimate(problem: Problem) -> NDArray[np.float32]:
     estimate = domain.pixels.copy()
     missing = ~domain.finite
     if missing.any():
-        observed = np.where(domain.trusted, domain.pixels, np.float32(0))
-        near = engine.apply(domain.trusted.astype(np.float32))[missing]
-        gathered = engine.apply(observed)[missing]
-        everywhere = np.float32(domain.pixels[domain.trusted].mean())
-        estimate[missing] = np.where(
-            near > _ENOUGH_NEIGHBOURS, gathered / np.maximum(near, _ENOUGH_NEIGHBOURS), everywhere
-        )
+        trusted, zero = domain.trusted, np.float32(0)
+        everywhere = np.float32(domain.pixels[trusted].mean())
+        gathered = _convolved(engine, lambda rows: np.where(trusted[rows], domain.pixels[rows], zero))
+        for rows, light in gathered:
+            np.copyto(estimate[rows], light, where=missing[rows])
+            del light  # it is a view of the plane, which is not needed any more
+        for rows, near in _convolved(engine, lambda rows: trusted[rows].astype(np.float32)):
+            mean = estimate[rows] / np.maximum(near, _ENOUGH_NEIGHBOURS)
+            known = np.where(near > _ENOUGH_NEIGHBOURS, mean, everywhere)
+            np.copyto(estimate[rows], known, where=missing[rows])
     return estimate
+
+
+def _convolved(
+    engine: Engine, rows_of: Callable[[slice], NDArray[np.float32]]
+) -> Iterator[tuple[slice, NDArray[np.float32]]]:
+    """The field that `rows_of` computes in blocks of rows, convolved with the PSF, in blocks of rows. Besides the
+    planes of the engine, only one is in memory.
+    """
+    lanes = engine.lanes_of(rows_of)
+    engine.rows_forward(lanes)
+    engine.columns(adjoint=False)
+    engine.rows_inverse(lanes)
+    for first, block in engine.row_blocks_of(lanes):
+        yield slice(first, first + len(block)), block
 
 
 def no_noise_model() -> DataError:

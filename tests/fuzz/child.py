@@ -7,6 +7,7 @@ of a DataError, or a fault. If the process dies, it dies with the seed after the
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import sys
 import traceback
@@ -17,8 +18,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy.io import fits
 
 from psfcore import build, limited
+from psfcore.deconvolve.doubts import input_warnings
+from psfcore.deconvolve.methods.registry import method_names
+from psfcore.deconvolve.run import deconvolve
+from psfcore.deconvolve.work import Options
 from psfcore.diffraction import combined, fraunhofer
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits
@@ -26,13 +32,18 @@ from psfcore.fits.header import read_summary
 from psfcore.fits.images import write_image
 from psfcore.fits.observation import read_observation
 from psfcore.fits.psfs import read_psf
+from psfcore.fits.saturation import with_saturation
+from psfcore.fits.unusable import unusable_pixels
 from psfcore.fits.viewing.regions import Region, write_cutout
+from psfcore.image import Image
 from psfcore.instruments.model import parse_instrument
 from psfcore.instruments.workload import check_workload
 from psfcore.scatter import power_law
 from psfcore.transit.manifest import parse_manifest
 from tests.fuzz.fits_inputs import compressed_image, plain_image
 from tests.fuzz.text_inputs import instrument, manifest
+from tests.image_contents import CONTENTS
+from tests.psfcore.conftest import gaussian, make_psf
 from workers.intake.costs import WORKER_MIB
 from workers.intake.estimates import estimate_build
 from workers.run.child import Child
@@ -71,6 +82,34 @@ def read_an_image(content: bytes, folder: Path) -> str:
     return "result"
 
 
+def content_of_an_image(seed: int) -> bytes:
+    """An image, as `numpy.save` stores it: the contents of two images side by side, scaled."""
+    rng = np.random.default_rng(seed)
+    size, names = int(rng.integers(40, 129)), list(CONTENTS)
+    left, right = (CONTENTS[names[int(rng.integers(len(names)))]](size) for _ in range(2))
+    scale = float(rng.choice([1.0, 1.0, -1.0, 0.0, 1e-6, 1e6]))
+    border = int(rng.integers(size))
+    file = io.BytesIO()
+    np.save(file, scale * np.hstack([left[:, :border], right[:, border:]]))
+    return file.getvalue()
+
+
+def deconvolve_an_image(content: bytes, folder: Path) -> str:
+    """Deconvolve an image, with the method that its size chooses, and compare it with the result."""
+    pixels = np.load(io.BytesIO(content))
+    methods = method_names()
+    method = methods[len(pixels) % len(methods)]
+    mask, warned = unusable_pixels(pixels, fits.Header(), None, {})
+    image = with_saturation(Image(pixels, mask, fits.Header(), "DN/s", 1.0, warnings=warned))
+    psf = make_psf(gaussian(33, 1.5))
+    warned = input_warnings(psf, image, method, channel=None)
+    options = Options(method=method, parameters={"steps": 2}, threads=1)
+    product = deconvolve(image, psf, options, warnings=warned)
+    assert np.isfinite(product.pixels[image.finite]).all()
+    json.dumps(product.details(), allow_nan=False)
+    return "result"
+
+
 def read_a_manifest(content: bytes, folder: Path) -> str:
     """Check a transit.json."""
     parse_manifest(content)
@@ -101,6 +140,7 @@ Maker = Callable[[int], bytes]
 KINDS: dict[str, tuple[Maker, Reader]] = {
     "tiles": (compressed_image, read_an_image),
     "headers": (plain_image, read_an_image),
+    "contents": (content_of_an_image, deconvolve_an_image),
     "manifests": (manifest, read_a_manifest),
     "instruments": (instrument, build_an_instrument),
 }

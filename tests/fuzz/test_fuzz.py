@@ -15,7 +15,7 @@ from tests.conftest import REPOSITORY
 from tests.fuzz.child import KINDS
 
 LONG = dict.fromkeys(KINDS, 20_000)
-COUNTS = {"tiles": 40, "headers": 40, "manifests": 40, "instruments": 6}
+COUNTS = {"tiles": 40, "headers": 40, "contents": 40, "manifests": 40, "instruments": 6}
 
 
 def outcomes(counts: dict[str, int], folder: Path) -> dict[str, Counter[str]]:

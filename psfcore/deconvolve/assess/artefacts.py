@@ -33,12 +33,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.deconvolve.assess import ranks
+from psfcore.deconvolve.edges import inside_band
 
 HOLE_SHARE = 0.02
 DETECTION_SIGMA = 5.0
@@ -47,6 +48,8 @@ EXTREME_SIGMA = 8.0
 ALARMS = {"holes_ppm": 100.0, "overshoots_ppm": 100.0, "new_extremes_ppm": 200.0, "ringing_pct": 2.0}
 RING_RADIUS_PX = 8
 _BLOCK_ROWS = 64
+_PLACES_AT_ONCE = 4096
+_MEDIAN_RADIUS_PX = 2
 _SOURCES = 100
 _FEWEST_SOURCES = 3
 _BRIGHTNESS_CLASSES = 16
@@ -91,7 +94,7 @@ def find_artefacts(
     noise_before = sigma or _estimated_noise(before, counted, classes)
     holes = _holes(before, after, counted, noise_before)
     overshoots = _overshoots(before, after, counted, noise_before, peak_weight)
-    extremes = counted & _new_extremes(before, after, noise_before, noise_after)
+    extremes = _new_extremes(before, after, counted, noise_before, noise_after)
     ringing, sources = ringing_pct(before, after, counted)
     area = max(1, int(np.count_nonzero(counted)))
     signs: dict[str, float | None] = {
@@ -194,9 +197,10 @@ def _blocks_with_rim(
     plane: Pixels, rim_px: int, rim: Literal["edge", "symmetric"]
 ) -> Iterator[tuple[slice, Pixels]]:
     """The blocks of `row_blocks`, and their pixels with a rim on all sides. rim: as the mode of `numpy.pad`."""
-    padded = np.pad(plane, rim_px, mode=rim)
     for rows in row_blocks(len(plane)):
-        yield rows, padded[rows.start : rows.stop + 2 * rim_px]
+        first, last = max(rows.start - rim_px, 0), min(rows.stop + rim_px, len(plane))
+        missing = (rim_px - (rows.start - first), rim_px - (last - rows.stop))
+        yield rows, np.pad(plane[first:last], (missing, (rim_px, rim_px)), mode=rim)
 
 
 def ringing_pct(before: Plane, after: Plane, counted: Flags) -> tuple[float | None, int]:
@@ -208,16 +212,17 @@ def ringing_pct(before: Plane, after: Plane, counted: Flags) -> tuple[float | No
     return 100 * max(0.0, rise_after - rise_before), len(sources)
 
 
-# The noise is computed only for the few pixels that the other conditions leave.
+# The noise is computed only for the pixels that the other conditions leave. These are few in most images, but they may
+# be all pixels, so each function looks at a block of rows at a time.
 
 
 def _holes(before: Plane, after: Plane, counted: Flags, noise_before: NoiseAt) -> Flags:
     """Find the counted pixels that fulfil Eq. (1)."""
-    holes = np.empty_like(counted)
+    holes = np.zeros_like(counted)
     for rows in row_blocks(len(before)):
-        holes[rows] = counted[rows] & (after[rows] < HOLE_SHARE * before[rows])
-    places = np.nonzero(holes)
-    holes[places] = before[places] > DETECTION_SIGMA * noise_before(places)
+        y, x = np.nonzero(counted[rows] & (after[rows] < HOLE_SHARE * before[rows]))
+        places = (y + rows.start, x)
+        holes[places] = before[places] > DETECTION_SIGMA * noise_before(places)
     return holes
 
 
@@ -225,100 +230,139 @@ def _overshoots(
     before: Plane, after: Plane, counted: Flags, noise_before: NoiseAt, peak_weight: float
 ) -> Flags:
     """Find the counted pixels that fulfil Eq. (2)."""
-    overshoots = np.empty_like(counted)
+    overshoots = np.zeros_like(counted)
     for rows in row_blocks(len(before)):
-        overshoots[rows] = counted[rows] & (after[rows] > before[rows].astype(np.float64) / peak_weight)
-    places = np.nonzero(overshoots)
-    limit = (before[places] + DETECTION_SIGMA * noise_before(places)) / peak_weight
-    overshoots[places] = after[places] > limit
+        y, x = np.nonzero(counted[rows] & (after[rows] > before[rows].astype(np.float64) / peak_weight))
+        places = (y + rows.start, x)
+        limit = (before[places] + DETECTION_SIGMA * noise_before(places)) / peak_weight
+        overshoots[places] = after[places] > limit
     return overshoots
 
 
-def _new_extremes(before: Plane, after: Plane, noise_before: NoiseAt, noise_after: NoiseLevels) -> Flags:
-    """Find the pixels that fulfil Eq. (3)."""
-    extremes = np.zeros(after.shape, dtype=np.bool_)
-    for sign, places in _peaks(before, after, noise_after).items():
-        limit = EXTREME_SIGMA * noise_after.at(before[places])
-        away_after = sign * (after[places] - _medians(after, places))
-        away_before = sign * (before[places] - _medians(before, places))
-        # A real peak or pit is also visible in the image before, except for the noise.
-        extremes[places] |= (away_after > limit) & (away_before < noise_before(places))
-    return extremes
-
-
-def _peaks(before: Plane, after: Plane, noise_after: NoiseLevels) -> dict[int, Places]:
-    """The pixels that may fulfil Eq. (3): with 1 those that are the largest of 3 x 3 px, with -1 the smallest ones.
+def _new_extremes(
+    before: Plane, after: Plane, counted: Flags, noise_before: NoiseAt, noise_after: NoiseLevels
+) -> Flags:
+    """Find the counted pixels that fulfil Eq. (3).
 
     A median lies between the minimum and the maximum of its pixels. If a pixel differs from both by less than the
-    limit, it cannot fulfil Eq. (3). Medians are therefore needed only for the few pixels that are left.
+    limit, it cannot fulfil Eq. (3). Medians are therefore needed only for the pixels that are left.
     """
-    peaks: dict[int, list[Places]] = {1: [], -1: []}
-    for rows, block in _blocks_with_rim(after, 2, "edge"):
-        pixels, inner = block[2:-2, 2:-2], block[1:-1, 1:-1]
-        for sign, nearest, farthest in ((1, np.maximum, np.minimum), (-1, np.minimum, np.maximum)):
-            away = sign * (pixels - _within(block, 2, farthest))
-            # The noise is computed only where the smallest noise of all would not be enough. It is rounded differently:
-            # the factor.
-            y, x = np.nonzero(
-                (pixels == _within(inner, 1, nearest)) & (away > 0.999 * EXTREME_SIGMA * noise_after.least)
-            )
-            left = away[y, x] > EXTREME_SIGMA * noise_after.at(before[rows][y, x])
-            peaks[sign].append((y[left] + rows.start, x[left]))
-    return {sign: tuple(map(np.concatenate, zip(*of_sign, strict=True))) for sign, of_sign in peaks.items()}
-
-
-def _maxima(plane: Pixels, radius_px: int) -> Pixels:
-    """Largest value of the square of 2 radius_px + 1 px around each pixel [y, x]; near an edge, of its part inside the
-    plane.
-    """
-    return _extremes(plane, radius_px, np.maximum)
-
-
-def _extremes(plane: Pixels, radius_px: int, chosen: np.ufunc) -> Pixels:
-    """As the filters of scipy.ndimage, but several times as fast."""
-    extremes = np.empty_like(plane)
-    for rows, block in _blocks_with_rim(
-        plane, radius_px, "edge"
-    ):  # repeated edge pixels do not change the extremes
-        extremes[rows] = _within(block, radius_px, chosen)
+    extremes = np.zeros_like(counted)
+    blocks = (_blocks_with_rim(plane, _MEDIAN_RADIUS_PX, "symmetric") for plane in (before, after))
+    for (rows, block_before), (_, block) in zip(*blocks, strict=True):
+        for sign in (1, -1):
+            y, x = _peaks(block, before[rows], noise_after, sign)
+            counted_here = counted[rows][y, x]
+            for portion in _portions(y[counted_here], x[counted_here]):
+                places = (portion[0] + rows.start, portion[1])
+                limit = EXTREME_SIGMA * noise_after.at(before[places])
+                away_after = sign * _differences(block, portion) > limit[:, None]
+                # A real peak or pit is also visible in the image before, except for the noise.
+                smooth_before = sign * _differences(block_before, portion) < noise_before(places)[:, None]
+                extremes[places] |= _mostly(away_after) & _mostly(smooth_before)
     return extremes
+
+
+def _peaks(block: Plane, before: Plane, noise_after: NoiseLevels, sign: int) -> Places:
+    """The pixels of a block that may fulfil Eq. (3): for the sign 1 those that are the largest of 3 x 3 px, for -1 the
+    smallest ones.
+
+    block: rows of the image after, with a rim of 2 px. before: the same rows of the image before.
+    """
+    nearest, farthest = (np.maximum, np.minimum) if sign > 0 else (np.minimum, np.maximum)
+    pixels, inner = block[2:-2, 2:-2], block[1:-1, 1:-1]
+    away = sign * (pixels - _within(block, _MEDIAN_RADIUS_PX, farthest))
+    # The noise is computed only where the smallest noise of all would not be enough. It is rounded differently: the
+    # factor.
+    y, x = np.nonzero(
+        (pixels == _within(inner, 1, nearest)) & (away > 0.999 * EXTREME_SIGMA * noise_after.least)
+    )
+    left = away[y, x] > EXTREME_SIGMA * noise_after.at(before[y, x])
+    return y[left], x[left]
+
+
+def _portions(*arrays: NDArray[Any]) -> Iterator[tuple[NDArray[Any], ...]]:
+    """Arrays (n,) of the same length, cut into portions of at most _PLACES_AT_ONCE."""
+    for first in range(0, len(arrays[0]), _PLACES_AT_ONCE):
+        yield tuple(values[first : first + _PLACES_AT_ONCE] for values in arrays)
+
+
+def _differences(block: Plane, places: Places) -> Plane:
+    """The pixels at these positions minus each pixel of the 5 x 5 px around them, (n, 25).
+
+    block: some rows with a rim of 2 px, which the positions do not count.
+    """
+    side = 2 * _MEDIAN_RADIUS_PX + 1
+    around = np.lib.stride_tricks.sliding_window_view(block, (side, side))[places].reshape(-1, side**2)
+    return np.asarray(around[:, side**2 // 2, None] - around)
+
+
+def _mostly(fulfilled: Flags) -> Flags:
+    """Whether more than half of an odd number of values fulfil a condition, (n,). If the condition is a limit, their
+    median then fulfils it too, and no value is sorted.
+    """
+    return np.asarray(np.count_nonzero(fulfilled, axis=1) > fulfilled.shape[1] // 2)
 
 
 def _within(block: Pixels, radius_px: int, chosen: np.ufunc) -> Pixels:
     """Extremes of the square around each pixel of a block, without a rim of radius_px."""
-    return _slid(_slid(block, radius_px, chosen).T, radius_px, chosen).T
+    width = 2 * radius_px + 1
+    return _slid(_slid(block, width, chosen).T, width, chosen).T
 
 
-def _slid(rows: Pixels, radius_px: int, chosen: np.ufunc) -> Pixels:
-    """Extremes of 2 radius_px + 1 successive rows. The windows double their height until they are high enough."""
-    full_height, height = 2 * radius_px + 1, 1
-    while height < full_height:
-        more = min(height, full_height - height)
+def _slid(rows: Pixels, count: int, chosen: np.ufunc) -> Pixels:
+    """Extremes of `count` successive rows. The windows double their height until they are high enough."""
+    height = 1
+    while height < count:
+        more = min(height, count - height)
         rows = chosen(rows[:-more], rows[more:])
         height += more
     return rows
 
 
-def _medians(plane: Plane, places: tuple[NDArray[np.intp], ...]) -> Plane:
-    """Median of the 5 x 5 px around each position in `places`; the plane is mirrored at its edges."""
-    mirrored = np.pad(plane, 2, mode="symmetric")
-    windows = np.lib.stride_tricks.sliding_window_view(mirrored, (5, 5))
-    return np.asarray(np.median(windows[places].reshape(len(places[0]), 25), axis=1))
-
-
 def _bright_sources(before: Plane, counted: Flags) -> NDArray[np.int64]:
-    """Positions [y, x] of the brightest compact peaks, shape (n, 2).
-
-    A peak is the largest value within RING_RADIUS_PX along both axes.
+    """Positions [y, x] of the brightest compact peaks, shape (n, 2): those that are more than twice as bright as the
+    circle around them.
     """
-    inside = np.zeros_like(counted)
-    inner = np.s_[RING_RADIUS_PX:-RING_RADIUS_PX]
-    inside[inner, inner] = _extremes(counted, RING_RADIUS_PX, np.minimum)[inner, inner]
-    peaks = np.argwhere(inside & (before == _maxima(before, RING_RADIUS_PX)))
-    height = before[tuple(peaks.T)]
-    peaks = peaks[height > 2 * np.maximum(_median_on_circle(before, peaks), 0)]
-    order = np.argsort(-before[tuple(peaks.T)], kind="stable")
-    return peaks[order[:_SOURCES]]
+    peaks = np.argwhere(_first_of_equals(_largest_around(before, counted)))
+    peaks = peaks[np.argsort(-before[tuple(peaks.T)], kind="stable")]
+    sources = peaks[:0]
+    for (portion,) in _portions(peaks):  # the brightest first: hardly ever is more than one portion needed
+        bright = before[tuple(portion.T)] > 2 * np.maximum(_median_on_circle(before, portion), 0)
+        sources = np.concatenate([sources, portion[bright]])[:_SOURCES]
+        if len(sources) == _SOURCES:
+            break
+    return sources
+
+
+def _largest_around(plane: Plane, counted: Flags) -> Flags:
+    """Find the pixels [y, x] that are the largest within RING_RADIUS_PX along both axes, where all pixels are
+    counted and inside the plane.
+    """
+    largest = np.zeros_like(counted)
+    blocks = zip(
+        _blocks_with_rim(plane, RING_RADIUS_PX, "edge"),
+        _blocks_with_rim(counted, RING_RADIUS_PX, "edge"),
+        strict=True,
+    )
+    for (rows, block), (_, counted_block) in blocks:
+        largest[rows] = plane[rows] == _within(block, RING_RADIUS_PX, np.maximum)
+        largest[rows] &= _within(counted_block, RING_RADIUS_PX, np.minimum)
+    inside = inside_band(largest.shape, RING_RADIUS_PX)
+    return np.asarray(largest & inside)
+
+
+def _first_of_equals(largest: Flags) -> Flags:
+    """Of the largest pixels [y, x] around, those without another one in the rows above or to the left, within
+    RING_RADIUS_PX along both axes. Two such pixels are equally bright. A plateau would otherwise have as many peaks as
+    pixels.
+    """
+    first, radius = np.zeros_like(largest), RING_RADIUS_PX
+    for rows, block in _blocks_with_rim(largest, radius, "edge"):
+        above = _slid(_slid(block[: -radius - 1], radius, np.maximum).T, 2 * radius + 1, np.maximum).T
+        left = _slid(block[radius:-radius, : -radius - 1].T, radius, np.maximum).T
+        first[rows] = largest[rows] & ~(above | left)
+    return first
 
 
 def _median_on_circle(plane: Plane, places: NDArray[np.int64]) -> Plane:

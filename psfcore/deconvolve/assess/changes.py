@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from enum import IntFlag
 from functools import partial
 from typing import TypeVar
@@ -254,9 +254,17 @@ def _structures(blocks: _Blocks) -> list[Structure]:
         return []
     low, high = blocks.old_levels[max(blocks.tails)]
     tails = (blocks.old <= low) | (blocks.old >= high)
-    old, new = blocks.old[tails], blocks.new[tails]
-    rows = (_structure(blocks, old, new, kind, tail) for tail in blocks.tails for kind in ("bright", "dark"))
-    return [row for row in rows if row is not None]
+    old, new = (means if tails.all() else means[tails] for means in (blocks.old, blocks.new))
+    rows = []
+    of_level: dict[tuple[str, float], Structure | None] = {}  # on a plateau, all tails have the same level
+    for tail, kind in ((tail, kind) for tail in blocks.tails for kind in ("bright", "dark")):
+        level = blocks.old_levels[tail][kind == "bright"]
+        if (kind, level) not in of_level:
+            of_level[kind, level] = _structure(blocks, old, new, kind, tail)
+        row = of_level[kind, level]
+        if row is not None:
+            rows.append(replace(row, tail_pct=tail))
+    return rows
 
 
 def _structure(blocks: _Blocks, old: Means, new: Means, kind: str, tail: float) -> Structure | None:
@@ -269,17 +277,25 @@ def _structure(blocks: _Blocks, old: Means, new: Means, kind: str, tail: float) 
     chosen = (old >= level if bright else old <= level) & (old > 0)
     if not chosen.any():
         return None
-    before, after = old[chosen].astype(np.float64), new[chosen].astype(np.float64)
-    change = _change_pct(before, after)
+    # On a plateau, the chosen blocks may be all blocks, so few arrays are in memory at a time.
+    before = old[chosen]
+    exact = before.astype(np.float64)
+    light_before, mean = exact.sum(keepdims=True), float(exact.mean())
+    del exact
+    change = new[chosen].astype(np.float64)
+    light_after = change.sum(keepdims=True)
+    _change_pct(before, change, out=change)
     return Structure(
         kind=kind,
         block_px=blocks.block_px,
         tail_pct=tail,
         blocks=before.size,
-        before=float(before.mean()),
-        sum_pct=_change_pct(before.sum(keepdims=True), after.sum(keepdims=True)).item(),
-        median_pct=float(np.median(change)),
-        up_to_pct=float(np.percentile(change, _LARGEST_PCT if bright else 100 - _LARGEST_PCT)),
+        before=mean,
+        sum_pct=_change_pct(light_before, light_after).item(),
+        median_pct=float(np.median(change, overwrite_input=True)),
+        up_to_pct=float(
+            np.percentile(change, _LARGEST_PCT if bright else 100 - _LARGEST_PCT, overwrite_input=True)
+        ),
     )
 
 
@@ -325,8 +341,9 @@ def _percentiles(
     return {f"p{level:g}": float(value) for level, value in zip(CHANGE_PERCENTILES, levels, strict=True)}
 
 
-def _change_pct(before: Plane, after: Plane) -> Plane:
-    change = np.asarray(after / before)  # Eq. (1)
+def _change_pct(before: Plane | Means, after: Plane, *, out: Plane | None = None) -> Plane:
+    """Eq. (1). out: the array that takes the result, for example `after`."""
+    change = np.divide(after, before, out=out)
     change -= 1
     change *= 100
     return change

@@ -225,8 +225,14 @@ def changes_in_product(
         stopped_because=details["stopped_because"],
         before=binned(image.pixels, step),
         after=binned(after.pixels, step),
-        suspected=np.unique(np.argwhere(suspected) // step, axis=0),
+        suspected=np.argwhere(_blocks_with_any(suspected, step)),
     )
+
+
+def _blocks_with_any(flags: NDArray[np.bool_], step: int) -> NDArray[np.bool_]:
+    """The blocks of step x step pixels [y, x] that contain a flag. The last blocks may be incomplete."""
+    rows, columns = (np.arange(0, side, step) for side in flags.shape)
+    return np.asarray(np.logical_or.reduceat(np.logical_or.reduceat(flags, rows, axis=0), columns, axis=1))
 
 
 def treat_many(

@@ -82,7 +82,8 @@ def _at_ranks(
     _collect(values, groups, wanted, ends - sizes, chosen)
     found = []
     for group, of_group in enumerate(bins):
-        ordered = np.sort(chosen[ends[group] - sizes[group] : ends[group]])
+        ordered = chosen[ends[group] - sizes[group] : ends[group]]
+        ordered.sort()
         left_out = np.cumsum(
             np.where(wanted[group], 0, counts[group])
         )  # values in lower bins that were not collected

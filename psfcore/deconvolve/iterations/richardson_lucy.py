@@ -120,8 +120,10 @@ def agreed(problem: Problem) -> Single | float:
     """Compute 1 / s of Eq. (1) on the domain. If all pixels are trusted, 1 / s is not needed, and the result is 1."""
     if problem.domain.trusted.all():
         return 1.0
-    ones = np.ones(problem.domain.shape, dtype=np.float32)
-    return np.asarray(1 / np.maximum(problem.engine.adjoint(ones), np.finfo(np.float32).eps))
+    ones = np.broadcast_to(np.float32(1), problem.domain.shape)  # one number, so that there is no plane of it
+    share = problem.engine.adjoint(ones)
+    np.maximum(share, np.finfo(np.float32).eps, out=share)
+    return np.divide(1, share, out=share)
 
 
 @compiled(fastmath=_SUMS, error_model="numpy")
