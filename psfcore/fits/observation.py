@@ -32,7 +32,7 @@ from psfcore.fits.unusable import ERRORS, FLAGS, unusable_pixels
 from psfcore.image import Image, MaskBit
 from psfcore.instruments.model import load_instrument
 
-LARGEST_PIXEL = 1e30  # products are single precision, and methods square the pixels
+LARGEST_PIXEL = 1e15  # the comparison sums squares of pixels in single precision, which ends at 3e38
 # Cards that name the kind of a frame, and the words of frames without the light of the Sun.
 _KIND_CARDS = ("IMG_TYPE", "IMGTYPE", "IMAGETYP", "EC_IMTYP", "FRAMETYP", "OBS_TYPE")
 # Cards with the value that says that the Earth, the Moon or the pointing hid the Sun (SDO; SWAP).
@@ -204,7 +204,7 @@ def _check_signal(image: Image, *, stored_as_integer: bool) -> None:
         raise DataError(
             "pixel-too-large",
             f"expected pixels between -{LARGEST_PIXEL:g} and {LARGEST_PIXEL:g}; got one of {farthest:g}: set such "
-            "pixels to NaN",
+            "pixels to NaN, or use a larger unit",
         )
     if not whole:  # saturated pixels are finite, but say nothing about the signal
         smallest, largest = _range_of(image.pixels[valid])

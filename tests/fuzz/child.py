@@ -87,7 +87,7 @@ def content_of_an_image(seed: int) -> bytes:
     rng = np.random.default_rng(seed)
     size, names = int(rng.integers(40, 129)), list(CONTENTS)
     left, right = (CONTENTS[names[int(rng.integers(len(names)))]](size) for _ in range(2))
-    scale = float(rng.choice([1.0, 1.0, -1.0, 0.0, 1e-6, 1e6]))
+    scale = float(rng.choice([1.0, 1.0, -1.0, 0.0, 1e-9, 1e9]))
     border = int(rng.integers(size))
     file = io.BytesIO()
     np.save(file, scale * np.hstack([left[:, :border], right[:, border:]]))

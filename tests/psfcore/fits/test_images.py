@@ -94,6 +94,7 @@ UNUSABLE = [
     (ramp() * 1e-300, {}, None, "no-signal"),
     (np.where(ramp() > 100, 500.0, 0.0), {"SATURATE": 400.0}, None, "no-signal: .* 380 brighter pixels"),
     (np.where(ramp() == 5.0, 1e300, ramp()), {}, None, "pixel-too-large"),
+    (ramp() * 1e14, {}, None, "pixel-too-large"),
     (np.where(ramp() == 5.0, -1e300, ramp()), {}, None, "pixel-too-large"),
     (ramp(), {"BUNIT": "DN/s"}, 100.0, "no-exposure"),
     (np.ones((10, 40)), {}, None, "too-small"),
