@@ -257,16 +257,34 @@ def deconvolve(
 class PsfSource:
     """The PSF of a deconvolution, which is read or built when it is needed.
 
-    - `load(header, progress)` reads it, or builds it for an image with this header.
-    - `possible_psfs(psf, header)`: variants of the PSF within its errors, on the pixels of the image.
-    - `key`: the same for the same PSF; None: the PSF belongs to the telescope in the header.
-    - `built`: what the instrument file says of a PSF that must be built, if it may be of another channel; such a PSF is
-      compared with the image before it is built.
-    - `kernel_shape`: (ny, nx) of its kernel. `plate_scale_arcsec`: of a PSF that gives none.
-    - `prepared` keeps PSFs and engines between images. `other_channel`: see `check_channel`.
-    - `seen_as` adds the instrument and the wavelength that the file does not name, for the checks.
-    - `used`: how cards name it; None: as the PSF says. `provenance`: of a PSF whose file does not say it.
-    - `warnings`: sentences about the PSF, by their codes.
+    Attributes
+    ----------
+    load
+        Function of a header and a function for the progress: it reads the PSF, or builds it for an image with this
+        header.
+    possible_psfs
+        Function of the PSF and a header that returns variants of the PSF within its errors, on the pixels of the image.
+    key
+        A value that is the same for the same PSF; None: the PSF belongs to the telescope in the header.
+    built
+        What the instrument file states about a PSF that must be built, if it may be of another channel. Such a PSF is
+        compared with the image before it is built.
+    kernel_shape
+        Shape (ny, nx) of the kernel.
+    plate_scale_arcsec
+        Plate scale of a PSF whose file gives none.
+    prepared
+        The PSFs and engines that are kept between images.
+    other_channel
+        See `check_channel`.
+    seen_as
+        Function that adds the instrument and the wavelength for the checks, if the file of the PSF does not name them.
+    used
+        The PSF as cards name it; None: as the PSF states.
+    provenance
+        Provenance of a PSF whose file does not state it.
+    warnings
+        Sentences about the PSF, by their codes.
     """
 
     load: Callable[[Header, Progress | None], Psf]
