@@ -68,7 +68,7 @@ class SetPlan:
     size_px, images
         Edge length and number of the images of each transit.
     only
-        Names of effects; every case has one of them, in turn. Empty: the effects are drawn.
+        Names of effects; every case has one of them, in turn.
     clean_only
         Whether all cases are without effects.
     built_diffraction
