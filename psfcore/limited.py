@@ -81,13 +81,25 @@ def run_limited(
 ) -> Answer:
     """Call ``function(target, path=path, **arguments)`` in a child process; returns its answer.
 
-    function: a function of a module that reads the file ``path``. target: an open file, to which it may write.
-    arguments, answer: values that JSON can hold. pixels: the number of pixels of the file, which limits the memory of
-    the child. seconds: the limit of its processor time. answer_bytes: the limit of what it writes to a file; default:
-    what the pixels explain, and no limit if there are none. Raises the DataError, HeaderError or OSError of the
-    function; DataError "unreadable-pixels" if the child crashed, or needed more memory or processor time, or wrote
-    more, than its pixels explain; OSError if the child was ended from outside again and again, or gave no answer in
-    PATIENCE_S.
+    Raises the DataError, HeaderError or OSError of the function; DataError "unreadable-pixels" if the child crashed, or
+    needed more memory or processor time, or wrote more, than its pixels explain; OSError if the child was ended from
+    outside again and again, or gave no answer in PATIENCE_S.
+
+    Parameters
+    ----------
+    function
+        A function of a module that reads the file ``path``.
+    target
+        An open file, to which the function may write.
+    arguments
+        Further arguments of the function. JSON must be able to hold these values and the answer of the function.
+    pixels
+        The number of pixels of the file, which limits the memory of the child.
+    seconds
+        The limit of the processor time of the child.
+    answer_bytes
+        The most bytes that the child may write to a file; default: as many as the pixels explain, and no limit if
+        `pixels` is 0.
     """
     path, file = Path(path).absolute(), os.stat(path)
     if path.parent == Path("/dev/fd"):  # such a path has a meaning in this process alone

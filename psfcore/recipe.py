@@ -25,9 +25,18 @@ def canonical_hash(content: Mapping[str, object]) -> str:
 class Recipe:
     """How a PSF is built.
 
-    text: the text of the instrument file. name: the name of the shipped instrument file; None: the user wrote the file.
-    mask_id: SHA-256 of the file with the mask image of the mount. size: px. component: the only component to build, in
-    lower case; None: the total PSF.
+    Attributes
+    ----------
+    text
+        The text of the instrument file.
+    name
+        The name of the shipped instrument file; None: the user wrote the file.
+    mask_id
+        SHA-256 of the file with the mask image of the mount.
+    size
+        Edge length of the PSF array, px.
+    component
+        The only component to build, in lower case; None: the total PSF.
     """
 
     text: str

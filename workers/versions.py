@@ -251,8 +251,19 @@ def interpolated_time(start: float, end: float, at: float) -> float:
 
     The time between the two PSFs is divided into equal steps of at most a day, at least FEWEST_STEPS of them; ``at`` is
     rounded to the nearest step. Rounding changes the weights of the two PSFs by at most 1 / (2 FEWEST_STEPS), less than
-    0.8 %, and makes at most one PSF for each day. start < end, start <= at <= end; all in seconds since 1970. The
-    result is a whole second, or ``start`` or ``end`` themselves.
+    0.8 %, and makes at most one PSF for each day.
+
+    Parameters
+    ----------
+    start, end
+        The times between which the PSF is interpolated, in seconds since 1970; start < end.
+    at
+        The time of the image, in seconds since 1970; start <= at <= end.
+
+    Returns
+    -------
+    float
+        A whole second, or ``start`` or ``end`` themselves.
     """
     steps = max(FEWEST_STEPS, math.ceil((end - start) / LONGEST_STEP_S))
     step = round((at - start) / (end - start) * steps)

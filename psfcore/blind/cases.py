@@ -61,12 +61,24 @@ _KIND_STREAM, _TRUTH_STREAM, _EFFECT_STREAM = 1, 2, 3
 class SetPlan:
     """The plan of a set.
 
-    cases: number of cases. size_px, images: of each transit. only: names of effects; every case has one of them, in
-    turn. clean_only: no case has an effect. built_diffraction: True: half of the cases have the diffraction PSF of the
-    instrument, and half a synthetic one. False: all have a synthetic one. left_pct: the residuals (percent) that an
-    effect should leave in the discs after a refit. The values are used in turn, each for all names of `only`. Empty:
-    the residuals are drawn at random; for the names of `only` from USUAL_PCT. withheld: the group of withheld effects,
-    a key of WITHHELD.
+    Attributes
+    ----------
+    cases
+        Number of cases.
+    size_px, images
+        Edge length and number of the images of each transit.
+    only
+        Names of effects; every case has one of them, in turn.
+    clean_only
+        Whether all cases are without effects.
+    built_diffraction
+        True: half of the cases have the diffraction PSF of the instrument, and half a synthetic one. False: all have a
+        synthetic one.
+    left_pct
+        The residuals (percent) that an effect should leave in the discs after a refit. The values are used in turn,
+        each for all names of `only`. Empty: the residuals are drawn at random; for the names of `only` from USUAL_PCT.
+    withheld
+        The group of withheld effects, a key of WITHHELD.
     """
 
     cases: int
@@ -84,10 +96,19 @@ class SetPlan:
 class Case:
     """One case before it is made.
 
-    kind: CLEAN, SINGLE, PAIR, FOREIGN or MIXED. law, glass: the true scatter and the known part of the PSF. effects:
-    the effects, at their nominal strengths. target_pct: the residual that each effect alone should leave in the discs
-    after a refit, percent; None: the strength of the effect is already set. headroom: the saturation level divided by
-    the value of the brightest pixel; None: no pixel saturates.
+    Attributes
+    ----------
+    kind
+        CLEAN, SINGLE, PAIR, FOREIGN or MIXED.
+    law, glass
+        The true scatter and the known part of the PSF.
+    effects
+        The effects, at their nominal strengths.
+    target_pct
+        The residual that each effect alone should leave in the discs after a refit, percent; None: the strength of the
+        effect is already set.
+    headroom
+        The saturation level divided by the value of the brightest pixel; None: no pixel saturates.
     """
 
     number: int

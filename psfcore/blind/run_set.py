@@ -60,12 +60,23 @@ def run_set(
 ) -> list[Run]:
     """Diagnose the cases that have no report yet. Returns one run for each of these cases, in the order of `numbers`.
 
-    diagnosis, bound: a program and its first arguments. Two arguments are added: a folder of images, and the file of
-    the result. diagnosis: it gets the transit and writes the report. bound: it gets the images without noise and writes
-    the bound; empty: no program is run. If it fails, the diagnosis is not affected, and the next run tries it again.
-    processes: number of diagnoses at the same time. keep: whether to keep the images of a case after their use.
-    longest_s: a process that takes longer is killed. Raises DataError "bad-seals", and "not-sealed" if a case has no
-    seal.
+    Raises DataError "bad-seals", and "not-sealed" if a case has no seal.
+
+    Parameters
+    ----------
+    diagnosis
+        The program that diagnoses a transit, and its first arguments. Two arguments are added: the folder of the
+        transit, and the file into which the program writes the report.
+    bound
+        The program that computes the bound, and its first arguments. Two arguments are added: the folder of the images
+        without noise, and the file into which the program writes the bound. If it fails, the diagnosis is not affected,
+        and the next run tries it again. Empty: no bound is computed.
+    processes
+        Number of diagnoses at the same time.
+    keep
+        Whether to keep the images of a case after their use.
+    longest_s
+        The longest time of a program, s; a program that takes longer is killed.
     """
     for number in numbers:
         if not blind_set.is_made(number):

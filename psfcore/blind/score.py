@@ -84,10 +84,18 @@ def row(
 ) -> Row:
     """A row of the table, as JSON.
 
-    values: one of each case: whether it meets a condition, or a number. of: the function that computes the figure from
-    the numbers. None: the figure is the fraction of the cases that meet the condition, divided by the mean of
-    ``expected``, the probability that a Bayes observer meets it (None: 1). Its interval is Eq. (1), divided by the same
-    mean, which is treated as exact. least, most: the goal. bounds: probabilities whose mean is stated beside the value.
+    Parameters
+    ----------
+    values
+        For each case a number, or whether the case meets a condition.
+    of
+        The function that computes the figure from the numbers. None: the figure is the fraction of the cases that meet
+        the condition, divided by the mean of ``expected``, the probability that a Bayes observer meets it (None: 1).
+        Its interval is Eq. (1), divided by the same mean, which is treated as exact.
+    least, most
+        The least and the largest value that meet the goal.
+    bounds
+        Probabilities whose mean is stated beside the value.
     """
     possible = len(values) if expected is None else math.fsum(expected)
     value = interval = None

@@ -36,12 +36,20 @@ def new_engine(psf: Psf, shape: Shape, span: Shape, threads: int) -> Engine:
 class Conditions:
     """Options that all methods have. Raises DataError "bad-margin" for a negative margin.
 
-    edges: assumption about the scene beyond the field; None: the default of the method.
-    margin_px: width of the margin beyond the field; None: the width is computed from the PSF. Edges "zero" have no
-    margin. noise: noise of the camera; required if the stopping rule is "discrepancy".
-    threads: number of threads; it does not change the result.
-    progress(step, steps) is called after each step; its exceptions are not caught.
-    engine_for: function that makes the engine; `PreparedPsfs.engine_for` keeps engines between images.
+    Attributes
+    ----------
+    edges
+        Assumption about the scene beyond the field; None: the default of the method.
+    margin_px
+        Width of the margin beyond the field; None: the width is computed from the PSF. Edges "zero" have no margin.
+    noise
+        Noise of the camera; required if the stopping rule is "discrepancy".
+    threads
+        Number of threads; it does not change the result.
+    progress
+        Function of the step and the number of steps that is called after each step; its exceptions are not caught.
+    engine_for
+        Function that makes the engine; `PreparedPsfs.engine_for` keeps engines between images.
     """
 
     edges: Edges | None = None
@@ -60,9 +68,17 @@ class Conditions:
 class OfBox:
     """How a box of an image was deconvolved alone (`psfcore.deconvolve.work`).
 
-    box: the box in the pixels of the whole image. rim_px: largest width of the rim around it. error: bound of the
-    difference from the deconvolution of the whole image, in the unit of the image; 0: there is no difference. mean: of
-    the valid pixels of the box in the image, in its unit.
+    Attributes
+    ----------
+    box
+        The box in the pixels of the whole image.
+    rim_px
+        Largest width of the rim around it.
+    error
+        Bound of the difference from the deconvolution of the whole image, in the unit of the image; 0: there is no
+        difference.
+    mean
+        Of the valid pixels of the box in the image, in its unit.
     """
 
     box: Box
@@ -80,15 +96,32 @@ class OfBox:
 class Deconvolved:
     """An estimate of the scene, and how the method reached it.
 
-    pixels: estimate [y, x] in the image's unit; NaN where the image has no finite value. stopped_because: reason why
-    the iteration ended. flux_in: sum of the image over its valid pixels. Negative pixels are included. flux_out: sum of
-    the estimate over the same pixels. negative_pixels: number of valid pixels below 0 in the image. last_change: rms of
-    the change in the last step, divided by the rms of the estimate. edges, margin_px: assumption about the scene beyond
-    the field, and width of the margin. edge_band_px: width of the band along the edges in which the result depends on
-    light from beyond the field. noise_amplification: rms noise of the estimate divided by the rms noise of the image,
-    for uncorrelated noise; None if the method is not linear. chi2_per_pixel: chi2 of the fit divided by the number of
-    judged pixels (`psfcore.deconvolve.problem`); None if the noise is not known. of_box: how the box was deconvolved,
-    if the result is a box of an image; None for a whole image.
+    Attributes
+    ----------
+    pixels
+        Estimate [y, x] in the image's unit; NaN where the image has no finite value.
+    stopped_because
+        Reason why the iteration ended.
+    flux_in
+        Sum of the image over its valid pixels. Negative pixels are included.
+    flux_out
+        Sum of the estimate over the same pixels.
+    negative_pixels
+        Number of valid pixels below 0 in the image.
+    last_change
+        Rms of the change in the last step, divided by the rms of the estimate.
+    edges, margin_px
+        Assumption about the scene beyond the field, and width of the margin.
+    edge_band_px
+        Width of the band along the edges in which the result depends on light from beyond the field.
+    noise_amplification
+        The rms noise of the estimate divided by the rms noise of the image, for uncorrelated noise; None if the method
+        is not linear.
+    chi2_per_pixel
+        The chi2 of the fit divided by the number of judged pixels (`psfcore.deconvolve.problem`); None if the noise
+        is not known.
+    of_box
+        How the box was deconvolved, if the result is a box of an image; None for a whole image.
     """
 
     pixels: NDArray[np.float64]

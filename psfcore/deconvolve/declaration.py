@@ -62,16 +62,29 @@ def steps(default: int, about: str | None = None) -> Parameter:
 class Method:
     """A method of deconvolution, except its iteration.
 
-    use: for which images it is good, in the first sentence, and what must be known about it. algorithm_version: raise
-    it when the same parameters give another result. edges: the default assumption about the scene beyond the edges.
-    margin_share: largest share of its light that a pixel at the edge may get from beyond the margin;
-    `psfcore.deconvolve.edges.margin_for` computes the default width of the margin from it. may_be_negative: whether
-    results can be negative. keeps_flux: whether the steps conserve the flux of the plane, and so compensate for light
-    that leaves it (`psfcore.deconvolve.work`).
+    `python -m benchmarks.growth memory` measures margin_of_psf, plane_bytes and transform_bytes for estimates. None:
+    not measured, and the largest figure of all methods counts.
 
-    For estimates, measured by `python -m benchmarks.growth memory`; None: not measured, so the largest figure of all
-    methods counts. margin_of_psf: default margin divided by half the width of the PSF. plane_bytes, transform_bytes:
-    see Eq. (1) of `psfcore.deconvolve.memory`.
+    Attributes
+    ----------
+    use
+        A text: its first sentence says for which images the method is good, the others what users must know about it.
+    algorithm_version
+        Raise it when the same parameters give another result.
+    edges
+        The default assumption about the scene beyond the edges.
+    margin_share
+        Largest share of its light that a pixel at the edge may get from beyond the margin;
+        `psfcore.deconvolve.edges.margin_for` computes the default width of the margin from it.
+    may_be_negative
+        Whether results can be negative.
+    keeps_flux
+        Whether the steps conserve the flux of the plane, and so compensate for light that leaves it
+        (`psfcore.deconvolve.work`).
+    margin_of_psf
+        Default margin divided by half the width of the PSF.
+    plane_bytes, transform_bytes
+        The memory of a plane and of a transform, bytes: see Eq. (1) of `psfcore.deconvolve.memory`.
     """
 
     name: str

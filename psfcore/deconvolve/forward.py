@@ -29,8 +29,18 @@ from psfcore.psf import Psf
 class Convolved:
     """A model image as a telescope records it.
 
-    pixels: [y, x] in the unit of the image; NaN where the image has no finite value. image: the model image. psf: the
-    PSF on the pixels of the image. edges: the assumed scene beyond the image. warnings: sentences by their codes.
+    Attributes
+    ----------
+    pixels
+        Recorded light [y, x] in the unit of the image; NaN where the image has no finite value.
+    image
+        The model image.
+    psf
+        The PSF on the pixels of the image.
+    edges
+        The assumed scene beyond the image.
+    warnings
+        Sentences by their codes.
     """
 
     pixels: NDArray[np.float64]

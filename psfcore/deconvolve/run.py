@@ -62,8 +62,16 @@ class UsedPsf:
 class Identities:
     """What a product file says about its origin.
 
-    product: id of the product; None: it was made without a request. input_sha256: hash of the file of the image; None:
-    not known. algorithm_version: version of the method. filename: name of the product.
+    Attributes
+    ----------
+    product
+        Id of the product; None: it was made without a request.
+    input_sha256
+        Hash of the file of the image; None: not known.
+    algorithm_version
+        Version of the method.
+    filename
+        Name of the product.
     """
 
     product: str | None
@@ -76,9 +84,18 @@ class Identities:
 class Product(Deconvolved):
     """A deconvolved image or box, with its inputs, its errors and its warnings.
 
-    image: the input, with its mask. psf: the PSF on the pixels of the image. errors: planes with the standard deviation
-    of each pixel, if they were asked for. noise: that of the camera, if errors were asked for. warnings: sentences by
-    their codes, the most harmful first.
+    Attributes
+    ----------
+    image
+        The input, with its mask.
+    psf
+        The PSF on the pixels of the image.
+    errors
+        Planes with the standard deviation of each pixel, if they were asked for.
+    noise
+        Noise of the camera, if errors were asked for.
+    warnings
+        Sentences by their codes, the most harmful first.
     """
 
     image: Image
@@ -240,16 +257,34 @@ def deconvolve(
 class PsfSource:
     """The PSF of a deconvolution, which is read or built when it is needed.
 
-    - `load(header, progress)` reads it, or builds it for an image with this header.
-    - `possible_psfs(psf, header)`: variants of the PSF within its errors, on the pixels of the image.
-    - `key`: the same for the same PSF; None: the PSF belongs to the telescope in the header.
-    - `built`: what the instrument file says of a PSF that must be built, if it may be of another channel; such a PSF is
-      compared with the image before it is built.
-    - `kernel_shape`: (ny, nx) of its kernel. `plate_scale_arcsec`: of a PSF that gives none.
-    - `prepared` keeps PSFs and engines between images. `other_channel`: see `check_channel`.
-    - `seen_as` adds the instrument and the wavelength that the file does not name, for the checks.
-    - `used`: how cards name it; None: as the PSF says. `provenance`: of a PSF whose file does not say it.
-    - `warnings`: sentences about the PSF, by their codes.
+    Attributes
+    ----------
+    load
+        Function of a header and a function for the progress: it reads the PSF, or builds it for an image with this
+        header.
+    possible_psfs
+        Function of the PSF and a header that returns variants of the PSF within its errors, on the pixels of the image.
+    key
+        A value that is the same for the same PSF; None: the PSF belongs to the telescope in the header.
+    built
+        What the instrument file states about a PSF that must be built, if it may be of another channel. Such a PSF is
+        compared with the image before it is built.
+    kernel_shape
+        Shape (ny, nx) of the kernel.
+    plate_scale_arcsec
+        Plate scale of a PSF whose file gives none.
+    prepared
+        The PSFs and engines that are kept between images.
+    other_channel
+        See `check_channel`.
+    seen_as
+        Function that adds the instrument and the wavelength for the checks, if the file of the PSF does not name them.
+    used
+        The PSF as cards name it; None: as the PSF states.
+    provenance
+        Provenance of a PSF whose file does not state it.
+    warnings
+        Sentences about the PSF, by their codes.
     """
 
     load: Callable[[Header, Progress | None], Psf]
@@ -299,13 +334,23 @@ def read_and_deconvolve(
     """Check an image and its PSF, and deconvolve the image in this process. Returns also the PSF as it was read or
     built.
 
-    read: reads the image. shape: its shape (ny, nx), if known from its header; then the job must fit into the free
-    memory, free_bytes. again: also deconvolve a product or a PSF. clip: changes the pixels after the warnings were
-    found; the product contains the unchanged image. begin: see `deconvolve`. say(code, message): called for each
-    warning before the work begins.
-
     Raises DataError "too-much-memory", "plate-scale-known", "plate-scale-mismatch", "channel-mismatch" and the errors
     of `check_exposure_of_sun`, of the source and of `deconvolve`.
+
+    Parameters
+    ----------
+    read
+        Function that reads the image.
+    shape
+        Shape (ny, nx) of the image, if its header states it; then the job must fit into `free_bytes` of free memory.
+    again
+        Deconvolve the image even if it is a product or a PSF.
+    clip
+        Function that changes the pixels after the warnings were found; the product contains the unchanged image.
+    begin
+        See `deconvolve`.
+    say
+        Function of a code and a message that is called for each warning before the work begins.
     """
     box = options.region
 

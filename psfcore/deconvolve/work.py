@@ -80,11 +80,19 @@ Plane = NDArray[np.float64]
 class Options(Conditions):
     """How an image is deconvolved.
 
-    method: name of the method; parameters: its own parameters, such as steps and stop. error_draws: number of noise
-    realisations (2 to 64) for the planes of errors; 0: no such planes. region: deconvolve only this box of the image,
-    with a rim that is so wide that the bound of its error is at most `region_error`, a share of the mean light of the
-    box. Raises DataError "bad-draws", "bad-margin", "region-errors", "unknown-method", and the errors of
-    `Method.complete`.
+    Raises DataError "bad-draws", "bad-margin", "region-errors", "unknown-method", and the errors of `Method.complete`.
+
+    Attributes
+    ----------
+    method
+        Name of the method.
+    parameters
+        The parameters of this method, such as steps and stop.
+    error_draws
+        Number of noise realisations (2 to 64) for the planes of errors; 0: no such planes.
+    region
+        The box of the image that is deconvolved alone; None: the whole image. Its rim is so wide that the bound of its
+        error is at most `region_error`, a share of the mean light of the box.
     """
 
     method: str = "richardson-lucy"
@@ -198,11 +206,26 @@ class Work:
 class BoxWork:
     """The deconvolution of a box. `run` and `assess` correspond to those of `Work`.
 
-    image: the box, as it was observed; its header has the coordinates of the box. work: the deconvolution of box and
-    rim. box, rim: the box, and the box with its rim, in the pixels of the whole image. shape: (ny, nx) of the whole
-    image. edges: the assumption about the scene beyond the whole image. of_mask: QUALITY of the box that follows from
-    the mask of box and rim. noise: noise of the camera, if known. error: Eq. (3), in the unit of the image; 0 if the
-    rim is the whole image. mean: of the valid pixels of the box, in the unit of the image.
+    Attributes
+    ----------
+    image
+        The box, as it was observed; its header has the coordinates of the box.
+    work
+        The deconvolution of box and rim.
+    box, rim
+        The box, and the box with its rim, in the pixels of the whole image.
+    shape
+        (ny, nx) of the whole image.
+    edges
+        The assumption about the scene beyond the whole image.
+    of_mask
+        QUALITY of the box that follows from the mask of box and rim.
+    noise
+        Noise of the camera, if known.
+    error
+        Eq. (3), in the unit of the image; 0 if the rim is the whole image.
+    mean
+        Mean of the valid pixels of the box, in the unit of the image.
     """
 
     image: Image

@@ -182,10 +182,22 @@ def half_width_px(radius_px: float) -> int:
 class Superposed:
     """Maps [y, x] by offset from the centre of the occulter, which is at [half_px, half_px]; nan outside the disc.
 
-    images: number of superposed discs. count: for each position, the number of images in which this pixel is dark.
-    noise_mpe_pct: standard error of the MPE from noise alone. noise_mape_pct: MAPE of noise alone. mpe_rms_pct,
-    mpe_largest_pct: rms and largest absolute value of the MPE over the map. mape_mean_pct, mape_largest_pct: mean and
-    largest value of the MAPE. mpe_noise_rms_pct, mape_noise_mean_pct: what noise alone gives.
+    Attributes
+    ----------
+    images
+        Number of superposed discs.
+    count
+        For each position, the number of images in which this pixel is dark.
+    noise_mpe_pct
+        Standard error of the MPE from noise alone.
+    noise_mape_pct
+        MAPE of noise alone.
+    mpe_rms_pct, mpe_largest_pct
+        Rms and largest absolute value of the MPE over the map.
+    mape_mean_pct, mape_largest_pct
+        Mean and largest value of the MAPE.
+    mpe_noise_rms_pct, mape_noise_mean_pct
+        The values of mpe_rms_pct and mape_mean_pct that noise alone gives.
     """
 
     images: int

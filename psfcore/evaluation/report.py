@@ -36,11 +36,18 @@ LEAST_TREND_FRAMES = 3
 @dataclass(frozen=True)
 class Summary:
     """Errors of the images of one pointing. The unit is percent of the observed mean, or the unit in the name of a
-    field.
+    field. A field whose name begins with ``centre_`` is the same quantity for the mean PE at the centre of the disc.
 
-    fov: the pointing; None: all pointings. mean_noise_pct: standard error of the mean from image noise. noise_pct: the
-    rms that image noise alone would cause. gap_pct: the rms with the noise subtracted in quadrature. centre_...: the
-    same quantities for the mean PE at the centre of the disc.
+    Attributes
+    ----------
+    fov
+        The pointing; None: all pointings.
+    mean_noise_pct
+        Standard error of the mean from image noise.
+    noise_pct
+        The rms that image noise alone would cause.
+    gap_pct
+        The rms with the noise subtracted in quadrature.
     """
 
     fov: int | None

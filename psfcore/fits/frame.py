@@ -44,8 +44,16 @@ UNIT: Matrix = ((1.0, 0.0), (0.0, 1.0))
 class Frame:
     """How the pixels of an image lie on the detector.
 
-    scale_arcsec: plate scale along x and y, arcsec/px; None: unknown. on_detector: T of Eq. (2). roll_known: whether a
-    card states the roll of the detector. interpolated: why the pixels are not those of the detector; None: they are.
+    Attributes
+    ----------
+    scale_arcsec
+        Plate scale along x and y, arcsec/px; None: unknown.
+    on_detector
+        T of Eq. (2).
+    roll_known
+        Whether a card states the roll of the detector.
+    interpolated
+        Why the pixels are not those of the detector; None: they are.
     """
 
     scale_arcsec: tuple[float | None, float | None]

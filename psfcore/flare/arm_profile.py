@@ -80,12 +80,23 @@ class ArmProfile:
 class FlareFit:
     """The light along an arm as simulated with one PSF, and the fitted flare.
 
-    box [y, x]: light of the flare. simulated: s_u. rms_pct: root mean square of 100 (s_u / d_u - 1) over the distances
-    with d_u > 0. chi2_per_distance: the sum in Eq. (2) divided by the number of distances; None if the noise is
-    unknown. reduced_chi2: the same sum divided by the degrees of freedom (number of distances - number of used pixels
-    of the box
-    + 1 for the constraint). matched: mean s divided by mean d at 60 to 70 px. matched_noise_pct: the noise of mean d,
-    in percent of mean d; the constraint treats mean d as exact.
+    Attributes
+    ----------
+    box
+        Light of the flare [y, x].
+    simulated
+        The simulated arm profile, s_u of the equations above.
+    rms_pct
+        Root mean square of 100 (s_u / d_u - 1) over the distances with d_u > 0.
+    chi2_per_distance
+        The sum in Eq. (2) divided by the number of distances; None if the noise is unknown.
+    reduced_chi2
+        The same sum divided by the degrees of freedom (number of distances - number of used pixels of the box + 1 for
+        the constraint).
+    matched
+        Mean s divided by mean d at 60 to 70 px.
+    matched_noise_pct
+        The noise of mean d, in percent of mean d; the constraint treats mean d as exact.
     """
 
     box: Plane

@@ -107,11 +107,18 @@ def measure_arms(
 ) -> ArmMeasurement:
     """Measure `n_arms` arms around a flare in `image` [y, x] (DN), or in `image` minus `reference`.
 
-    centre_xy: position of the source; default: the middle of the largest saturated patch, else the brightest pixel.
-    saturated: True where pixels must not be used; pixels that are not finite are never used. source_radius_px: half
-    size of S; default: from the saturated patch. reach_px: largest radius at which orders are used.
-
     Raises DataError "arms-bad-input", "all-masked", "no-flare", "too-few-peaks".
+
+    Parameters
+    ----------
+    centre_xy
+        Position of the source; default: the middle of the largest saturated patch, else the brightest pixel.
+    saturated
+        True where pixels must not be used; pixels that are not finite are never used.
+    source_radius_px
+        Half size of S; default: from the saturated patch.
+    reach_px
+        Largest radius at which orders are used.
     """
     difference, usable, patch = prepared(image, reference, saturated)
     centre, patch_radius = source_centre(difference, usable, patch, centre_xy)

@@ -45,10 +45,17 @@ def judge_on_flare(
 ) -> FlareTest:
     """Simulate the stray light of a flare with ``psf``, and compare it with the observed light along a diffraction arm.
 
-    centre_xy: position of the flare, px, which is rounded; default: it is found in the images. arm_deg: direction of
-    the arm, from +x towards +y; default: it is measured, and the arm nearest to +x is used. noise: the noise of the
-    camera; chi2 is computed only if it is given. Raises DataError "plate-scale-mismatch", "flare-shapes",
-    "flare-units", and the errors of ``compare_on_flare`` and ``measure_arms``.
+    Raises DataError "plate-scale-mismatch", "flare-shapes", "flare-units", and the errors of ``compare_on_flare`` and
+    ``measure_arms``.
+
+    Parameters
+    ----------
+    centre_xy
+        Position of the flare, rounded to whole px; default: the position found in the images.
+    arm_deg
+        Direction of the arm, from +x towards +y; default: the measured direction of the arm nearest to +x.
+    noise
+        The noise of the camera; chi2 is computed only if it is given.
     """
     check_compatible(flaring, psf)
     light, quiet, unit = _same_unit(flaring, before)

@@ -73,14 +73,34 @@ class Shrinking:
 class Diagnosis:
     """The diagnosis of one transit.
 
-    Three values of the gap: before_refit, with the PSF that was fitted together with the told causes, but without them;
-    rms, with the PSF refitted without any cause; after, with the told causes in the model. fits: the linear fits of all
-    single effects, by name, the most probable first. told: the linear fit of the told causes together; None if there
-    are none. p_value: the p-value of the gap. limits: the limits of all effects. shrinking: how far each single effect
-    closes the gap, by name. shrinking_of_told: the same for the told causes. corrected: the full refit with the told
-    causes, if they are effects of the library and the refit succeeded. shapes: the shape of each alternative that is
-    another form of its family, by the name of the family. residual, residual_after: the residuals of held-out images
-    without and with the told causes. cautions: sentences on everything that weakens the result.
+    Attributes
+    ----------
+    before_refit
+        The gap with the PSF that was fitted together with the told causes, but without these causes.
+    rms
+        The gap with the PSF that was fitted without any cause.
+    after
+        The gap with the told causes in the model.
+    fits
+        The linear fits of all single effects, by name, the most probable first.
+    told
+        The linear fit of the told causes together; None if there are none.
+    p_value
+        The p-value of the gap.
+    limits
+        The limits of all effects.
+    shrinking
+        How far each single effect closes the gap, by name.
+    shrinking_of_told
+        The same for the told causes.
+    corrected
+        The full refit with the told causes, if they are effects of the library and the refit succeeded.
+    shapes
+        The shape of each alternative that is another form of its family, by the name of the family.
+    residual, residual_after
+        The residuals of held-out images without and with the told causes.
+    cautions
+        Sentences on everything that weakens the result.
     """
 
     answer: Answer
@@ -141,13 +161,23 @@ def diagnose(
 ) -> Diagnosis:
     """Fit a transit and diagnose the residuals of the fit.
 
-    start: the coordinates of the shape from which the fit starts (None: the default start of the shape). refit: whether
-    to make a full refit with the told causes in the model. seed: seeds the simulation and the bootstrap of the
-    intervals. coverage: the probability with which a group of alternatives contains the true cause. solution: an
-    existing solution of this transit, shape and start, or a function that makes it; None: `invert` makes it. If the
-    noise measured in the images differs from the noise that the transit states, the solution must be made with the
-    measured noise. Raises the errors of `psfcore.scatter.inversion.solution_of` and `invert`, DataError "bad-library"
-    if the library is empty, "bad-coverage", and "bad-effects" if an added effect fails.
+    Raises the errors of `psfcore.scatter.inversion.solution_of` and `invert`, DataError "bad-library" if the library is
+    empty, "bad-coverage", and "bad-effects" if an added effect fails.
+
+    Parameters
+    ----------
+    start
+        The coordinates of the shape from which the fit starts (None: the default start of the shape).
+    refit
+        Whether to make a full refit with the told causes in the model.
+    seed
+        Seed of the simulation and the bootstrap of the intervals.
+    coverage
+        The probability with which a group of alternatives contains the true cause.
+    solution
+        An existing solution of this transit, shape and start, or a function that makes it; None: `invert` makes it. If
+        the noise measured in the images differs from the noise that the transit states, the solution must be made with
+        the measured noise.
     """
     if not library:
         raise DataError("bad-library", "expected a library with at least one effect; got none: add an effect")

@@ -54,16 +54,33 @@ class Change:
 class Effect:
     """One effect: its physical cause, the observation that would confirm it, and the axes along which the gap varies.
 
-    family: the name of its family in `evidence.tree`; empty: a family of its own. cause: a sentence for the report.
-    settled_by: an observation that would confirm the effect, or exclude it. axes: names of the axes of the report along
-    which the effect varies. changes(view): one change for each parameter. An effect that is fitted for each pointing
-    may return fewer or more changes than it has parameters. In this case, changes and parameters are paired in order. A
-    change or parameter without a partner is not fitted. why_not(view): the reason why these data cannot show the
-    effect; None if they can. trials: the approximate number of positions or templates among which the effect searches;
-    it raises the p-value and the detection limit. distinguished(view): how many of these the data distinguish
-    (`search.distinguished`; None: all of them); a larger number lowers the evidence. held(view): for an effect that
-    searches for a position or a template, the same effect with the result of the search fixed. field: whether the
-    parameters describe a random field, in which each parameter is about as large as `likely`.
+    Attributes
+    ----------
+    family
+        The name of its family in `evidence.tree`; empty: a family of its own.
+    cause
+        A sentence for the report.
+    settled_by
+        An observation that would confirm the effect, or exclude it.
+    axes
+        Names of the axes of the report along which the effect varies.
+    changes
+        Function of the view that returns one change for each parameter. An effect that is fitted for each pointing may
+        return fewer or more changes than it has parameters. In this case, changes and parameters are paired in order. A
+        change or parameter without a partner is not fitted.
+    why_not
+        Function of the view that returns the reason why these data cannot show the effect; None if they can.
+    trials
+        The approximate number of positions or templates among which the effect searches; it raises the p-value and the
+        detection limit.
+    distinguished
+        Function of the view that returns how many of these positions or templates the data distinguish
+        (`search.distinguished`). A larger number lowers the evidence. None: the data distinguish all of them.
+    held
+        Function of the view, for an effect that searches for a position or a template: it returns the same effect with
+        the result of the search fixed.
+    field
+        Whether the parameters describe a random field, in which each parameter is about as large as `likely`.
     """
 
     name: str

@@ -28,5 +28,13 @@ def sha256_of_source(source: str) -> str:
 
 
 def bad_effects(source: str, what: str) -> DataError:
-    """The error "bad-effects" of an added file or module. what: a description of the mistake."""
+    """The error "bad-effects" of a file or module with added effects.
+
+    Parameters
+    ----------
+    source
+        The file or module.
+    what
+        A description of the mistake.
+    """
     return DataError("bad-effects", f"effects of {source}: {what}")

@@ -190,13 +190,19 @@ class Distances:
 class Mesh:
     """A mesh with square or hexagonal openings that supports a filter.
 
-    ``pitch_um``: from the centre of an opening to that of the next. ``angle_deg``: the direction of this step; in a
-    square mesh, the wires have this direction and the one across it.
-
-    ``windows``: number of windows of the diffraction series in each direction. At the entrance, this is the diameter of
-    the aperture divided by the pitch; at the filter wheel, the number of windows that the light crosses.
-    ``share``: the fraction of the light that crosses this mesh, if several meshes are mounted side by side.
-    ``basis``: "assumed" if any of these numbers is; each use of the PSF then says so.
+    Attributes
+    ----------
+    pitch_um
+        The distance from the centre of an opening to the centre of the next opening.
+    angle_deg
+        The direction of this step; in a square mesh, the wires have this direction and the one across it.
+    windows
+        Number of windows of the diffraction series in each direction. At the entrance, this is the diameter of the
+        aperture divided by the pitch; at the filter wheel, the number of windows that the light crosses.
+    share
+        The fraction of the light that crosses this mesh, if several meshes are mounted side by side.
+    basis
+        "assumed" if any of these numbers is; each use of the PSF then says so.
     """
 
     name: Name

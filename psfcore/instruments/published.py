@@ -16,12 +16,29 @@ from psfcore.instruments.files import WAVELENGTH_TOLERANCE
 class Published:
     """A published PSF.
 
-    channel: wavelength in angstrom, or the energy. contains: the parts of the PSF. citation, doi: of the publication;
-    doi None: no DOI is known. file: name of the published file, (size_px, size_px) px. addresses: where it is, the next
-    one is asked if one fails; empty: place says where to find it. origins: schemes and hosts of the servers that are
-    asked, also those to which an answer leads. instrument: as cards name it. cards: further cards that images must
-    agree with. file_mib: None if unknown. sha256: of the published file; None: the repository tells a checksum at
-    checksum_address; if that is empty, none is known.
+    Attributes
+    ----------
+    channel
+        Wavelength in angstrom, or the energy.
+    contains
+        The parts of the PSF.
+    citation, doi
+        Citation and DOI of the publication; None: no DOI is known.
+    file
+        Name of the published file, (size_px, size_px) px.
+    addresses
+        Addresses of the file; if one fails, the next one is asked. Empty: `place` says where to find the file.
+    origins
+        Schemes and hosts of the servers that may be asked, including those to which an answer redirects.
+    instrument
+        The instrument, as cards name it.
+    cards
+        Further cards that images must agree with.
+    file_mib
+        Size of the published file, MiB; None: unknown.
+    sha256
+        SHA-256 of the published file. None: the repository states a checksum at `checksum_address`; if this address is
+        empty, no checksum is known.
     """
 
     name: str

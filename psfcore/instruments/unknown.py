@@ -77,10 +77,17 @@ class SuitedInstrument(Suited):
 class Telescope:
     """A telescope without an instrument file.
 
-    cards: an image is of this telescope if its header agrees with one of these tables. A table holds fields of the
-    header summary (`psfcore.fits.header.HeaderSummary`), and the text with which each of them begins, in any case.
-    angstrom: the wavelengths of the images that the entry describes; empty: all wavelengths. reason: why there is no
-    file. ways: sentences about the steps with which a publication or a file helps; the recommended step comes first.
+    Attributes
+    ----------
+    cards
+        An image is of this telescope if its header agrees with one of these tables. A table holds fields of the header
+        summary (`psfcore.fits.header.HeaderSummary`), and the text with which each of them begins, in any case.
+    angstrom
+        The wavelengths of the images that the entry describes; empty: all wavelengths.
+    reason
+        Why there is no file.
+    ways
+        Sentences about the steps with which a publication or a file helps; the recommended step comes first.
     """
 
     name: str

@@ -33,9 +33,18 @@ MOST_ORDERS = 10_000  # of a hexagonal mesh, from the centre to the corner of th
 class Workload:
     """Sizes of the arrays for one spectral line: the line with the shortest wavelength, which needs the largest arrays.
 
-    airy_points: points of the table of the analytic pattern. cells: cells of one axis of each rotated mesh. orders: of
-    each hexagonal mesh, up to the corner. mask: whether the mask of the pupil is transformed. mount_entries: entries of
-    the list of edges by rows of the mask.
+    Attributes
+    ----------
+    airy_points
+        Points of the table of the analytic pattern.
+    cells
+        Cells of one axis of each rotated mesh.
+    orders
+        Orders of each hexagonal mesh, up to the corner.
+    mask
+        Whether the mask of the pupil is transformed.
+    mount_entries
+        Entries of the list of edges by rows of the mask.
     """
 
     samples: float

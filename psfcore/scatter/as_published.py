@@ -91,12 +91,20 @@ LEAST_OF_MEAN = 0.5
 class Choices:
     """The four biases of the published fit. True: as published. False: corrected.
 
-    weighed_by_observed: each equation is divided by its own noisy intensity; the fitted light in faint discs is then
-    too low. Corrected: each equation is divided by the noise expected at the disc's mean. added: the scatter kernel is
-    added to the diffraction PSF, Eq. (1). Corrected: kernel and diffraction PSF are convolved, so the ring sums are
-    computed from the diffracted scene. counted_on_array: the unscattered light is 1 minus the scatter summed over the
-    array of the diffraction PSF. Corrected: the sum covers the full reach. whole_disc_blanked: all pixels whose centres
-    lie within the radius are set to zero. Corrected: only the fully dark pixels are set to zero.
+    Attributes
+    ----------
+    weighed_by_observed
+        Each equation is divided by its own noisy intensity; the fitted light in faint discs is then too low. Corrected:
+        each equation is divided by the noise expected at the disc's mean.
+    added
+        The scatter kernel is added to the diffraction PSF, Eq. (1). Corrected: kernel and diffraction PSF are
+        convolved, so the ring sums are computed from the diffracted scene.
+    counted_on_array
+        The unscattered light is 1 minus the scatter summed over the array of the diffraction PSF. Corrected: the sum
+        covers the full reach.
+    whole_disc_blanked
+        All pixels whose centres lie within the radius are set to zero. Corrected: only the fully dark pixels are set to
+        zero.
     """
 
     weighed_by_observed: bool = True
@@ -299,11 +307,19 @@ def _fit_subsets(equations: Equations, counts: Vector, seed: int, subsets: int, 
 class Published:
     """The result of the published recipe.
 
-    a, b_px, c: the power law of the last round. spread: standard deviations of a, b_px and c over the subsets; None if
-    fewer than two subsets were kept. total: the fraction of scattered light, summed over a square grid of grid_px
-    pixels. rounds: for each round, "free shells" or "softened power law", and 1 - encircled energy (in percent) at
-    radii_px of the total PSF, which is the scatter kernel convolved with the diffraction PSF. equations: the number of
-    equations in the last round.
+    Attributes
+    ----------
+    a, b_px, c
+        The power law of the last round.
+    spread
+        Standard deviations of a, b_px and c over the subsets; None if fewer than two subsets were kept.
+    total
+        The fraction of scattered light, summed over a square grid of grid_px pixels.
+    rounds
+        For each round, "free shells" or "softened power law", and 1 - encircled energy (in percent) at radii_px of the
+        total PSF, which is the scatter kernel convolved with the diffraction PSF.
+    equations
+        The number of equations in the last round.
     """
 
     a: float

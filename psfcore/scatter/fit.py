@@ -113,11 +113,20 @@ class ShellWeightFits:
 class TransitFit:
     """The complete fit of a transit.
 
-    kernel, scatter: total PSF and scatter kernel [y, x] on the full reach. curve, diffuse_curve: C(R) of the total PSF
-    and of the scatter kernel. free: the free fit of shells; None for shapes that are not isotropic. shapes: the
-    compared shapes; empty if the fitted shape is not the softened power law. published, published_alone: the published
-    recipe and its variants with one corrected bias, if requested. limits: sentences about quantities that these data do
-    not determine, and about signs that the fit is unreliable.
+    Attributes
+    ----------
+    kernel, scatter
+        Total PSF and scatter kernel [y, x] on the full reach.
+    curve, diffuse_curve
+        C(R) of the total PSF and of the scatter kernel.
+    free
+        The free fit of shells; None for shapes that are not isotropic.
+    shapes
+        The compared shapes; empty if the fitted shape is not the softened power law.
+    published, published_alone
+        The published recipe and its variants with one corrected bias, if requested.
+    limits
+        Sentences about quantities that these data do not determine, and about signs that the fit is unreliable.
     """
 
     transit: Transit

@@ -90,14 +90,20 @@ def invert(
 ) -> Solution:
     """Fit a shape of scatter to a transit.
 
-    start: coordinates at which the fit starts; default: shape.start. near: True if these coordinates come from a fit to
-    nearly the same images. Then the fit does not begin with a pilot fit to a few images. The occulters are located
-    again only if the fit does not converge, or if C(R) changes by 0.3 percentage points or more. counts: how many times
-    each image counts; default: once. An image with count 0 is held out of the fit, but it still helps to locate the
-    occulters of its neighbours in time.
-
     Raises DataError "too-few-frames" if fewer than three frames contain an occulter, and "transit-says-too-little" if
     the frames do not determine all parameters.
+
+    Parameters
+    ----------
+    start
+        Coordinates at which the fit starts; default: shape.start.
+    near
+        True if these coordinates come from a fit to nearly the same images. Then the fit does not begin with a pilot
+        fit to a few images. The occulters are located again only if the fit does not converge, or if C(R) changes by
+        0.3 percentage points or more.
+    counts
+        How many times each image counts; default: once. An image with count 0 is held out of the fit, but it still
+        helps to locate the occulters of its neighbours in time.
     """
     total = TotalPsf(transit.diffraction, shape, transit.shape, threads=threads)
     at = shape.start if start is None else np.asarray(start, dtype=np.float64)

@@ -209,8 +209,13 @@ class Blur:
 class Optics(Blur):
     """Convolution with a PSF, and its approximate inverse.
 
-    least_transfer: the smallest absolute value of the PSF's Fourier transform. Eq. (1) converges at once where it is at
-    least LEAST_TRANSFER of `psfcore.deconvolve.iterations.linear`, and slowly where it is smaller.
+    Eq. (1) converges at once at the frequencies where the absolute value of the PSF's Fourier transform is at least
+    LEAST_TRANSFER of `psfcore.deconvolve.iterations.linear`, and slowly at the others.
+
+    Attributes
+    ----------
+    least_transfer
+        The smallest absolute value of the PSF's Fourier transform.
     """
 
     def __init__(self, psf_kernel: Kernel, field_shape: tuple[int, int], *, threads: int = 1) -> None:

@@ -54,11 +54,23 @@ class Shot:
 class Plan:
     """Everything that determines a simulated transit except the PSF and the seed.
 
-    views: one of VIEWS for each pointing, in the order of their numbers. ephemeris_error_px: rms error of the reported
-    position along each axis. saturation_dn: level at which high-only images clip; None: no saturation. Combined images
-    do not saturate. brightness: factor by which the scenes are multiplied. oversampling: number of scene pixels in a
-    detector pixel along each axis, 1 or 2. beyond: "dark" if the scene ends at the edge of the field; "on" if the Sun
-    continues for beyond_px on each side (None: half the field). Raises DataError "bad-plan".
+    Raises DataError "bad-plan".
+
+    Attributes
+    ----------
+    views
+        One of VIEWS for each pointing, in the order of their numbers.
+    ephemeris_error_px
+        Rms error of the reported position along each axis.
+    saturation_dn
+        Level at which high-only images clip; None: no saturation. Combined images do not saturate.
+    brightness
+        Factor by which the scenes are multiplied.
+    oversampling
+        Number of scene pixels in a detector pixel along each axis, 1 or 2.
+    beyond
+        "dark" if the scene ends at the edge of the field; "on" if the Sun continues for beyond_px on each side (None:
+        half the field).
     """
 
     size_px: int

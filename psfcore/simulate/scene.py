@@ -70,9 +70,20 @@ _REGIONS = (_Region(0.78, 0.24, 0.13, 2300.0, 34), _Region(0.44, 0.31, 0.075, 18
 class Layout:
     """The parts of a scene; lengths in field edges.
 
-    limb_centre, limb_radius: (x, y) and radius of the solar disc. corona_dn_per_s: brightness of the corona at the
-    limb. corona_height: scale height of the corona. sky_dn_per_s: background that is added everywhere. regions: the
-    active regions. filament: whether there is a filament.
+    Attributes
+    ----------
+    limb_centre, limb_radius
+        (x, y) and radius of the solar disc.
+    corona_dn_per_s
+        Brightness of the corona at the limb.
+    corona_height
+        Scale height of the corona.
+    sky_dn_per_s
+        Background that is added everywhere.
+    regions
+        The active regions.
+    filament
+        Whether there is a filament.
     """
 
     limb_centre: tuple[float, float] = (1.52, 0.30)

@@ -85,9 +85,18 @@ _COMMENTS = {
 class Imitated:
     """The instrument that simulated headers imitate.
 
-    name: the instrument's name in transit.json. texts: keywords that identify the instrument, with their values.
-    wavelength_angstrom: a whole number, the value of WAVELNTH. date_key, exposure_key: the keywords of the start and of
-    the exposure time. has_gain_modes: whether GAINCOMB is written.
+    Attributes
+    ----------
+    name
+        The instrument's name in transit.json.
+    texts
+        Keywords that identify the instrument, with their values.
+    wavelength_angstrom
+        A whole number, the value of WAVELNTH.
+    date_key, exposure_key
+        The keywords of the start and of the exposure time.
+    has_gain_modes
+        Whether GAINCOMB is written.
     """
 
     name: str

@@ -68,10 +68,20 @@ _DIFFERENCE_PX = 0.05
 class FoundPlace:
     """The position of an occulter with its errors (px, each axis), and how it was found.
 
-    The errors from the patch are multiplied by sqrt(chi2_per_pixel) if this factor is above 1. neighbours: number of
-    frames that show the scene behind the occulter; 0 if the ring around the disc was used. settled: whether the steps
-    converged. depth: the missing light divided by the light that a disc would hide; 1 with an occulter, 0 without an
-    occulter. depth_sigma: the error of depth. within_reach: whether the position is near enough to the ephemeris.
+    The errors from the patch are multiplied by sqrt(chi2_per_pixel) if this factor is above 1.
+
+    Attributes
+    ----------
+    neighbours
+        Number of frames that show the scene behind the occulter; 0 if the ring around the disc was used.
+    settled
+        Whether the steps converged.
+    depth
+        The missing light divided by the light that a disc would hide; 1 with an occulter, 0 without an occulter.
+    depth_sigma
+        The error of depth.
+    within_reach
+        Whether the position is near enough to the ephemeris.
     """
 
     place: Place

@@ -128,7 +128,7 @@ def get_psf_for_image(
     """The certified PSF for the instrument, channel and time of observation in the image's header, or the PSF that a
     context pins.
 
-    `POST /v1/estimates` says which PSF a deconvolution would use, also if none is certified.
+    `POST /v1/estimates` says which PSF a deconvolution would use, even if none is certified.
     """
     row = state.row(ImageRow, image_id, caller.owner)
     return _choice(lambda: look_for_image(state.catalogue, row.summary, caller.owner, context, kind))

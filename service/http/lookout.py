@@ -1,9 +1,9 @@
 """One look at the database for all streams of events of an owner, every ``LOOK_EVERY_S`` seconds.
 
-Each stream is a follower, which remembers the version of each job and bulk run that it told last. Its first look is its
-own: it brings what the client does not know yet. From then on the lookout of the owner looks for all followers
-together. First looks and common ones come one after the other, so no change falls between them: what a first look did
-not see, the next common look tells.
+Each stream is a follower, which remembers the last version of each job and bulk run that it sent to its client. A new
+follower first looks at the database alone, for all that its client does not know yet. From then on, the lookout of the
+owner looks for all followers together. A first look and a common look never run at the same time, so no change is lost
+between them: the next common look reports what the first look did not see.
 """
 
 from __future__ import annotations

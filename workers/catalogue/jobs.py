@@ -2,7 +2,8 @@
 
 The state of a job is stored only in the table of jobs, because the broker may lose messages. Every change of a job's
 phase is a compare-and-set on the row. Therefore any number of workers, servers and reconcilers may try to change it at
-the same moment. Times that they compare with each other, such as heartbeats, come from the database's clock.
+the same moment. Heartbeats and the other times that one process compares with those of another come from the
+database's clock.
 A worker takes a part of a job by compare-and-set too, and then has a lease for it.
 """
 

@@ -158,7 +158,16 @@ class Quotas(Queries):
         """Owner, id and bytes of the rows of a kind that were made before this time; of jobs and bulk runs, that ended
         before this time. Uploads that an unfinished job or bulk run uses are left out.
 
-        owner: only the rows of this owner; empty: the rows of all owners except ``others``.
+        Parameters
+        ----------
+        kind
+            The kind of the rows, a key of KEPT.
+        before
+            The time, in seconds since 1970.
+        owner
+            The owner of the rows; empty: all owners except ``others``.
+        others
+            The owners whose rows are left out if ``owner`` is empty.
         """
         table = KEPT[kind]
         has_file = table in WITH_FILES

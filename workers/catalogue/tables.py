@@ -80,7 +80,7 @@ def _change_time() -> MappedColumn[float]:
 
 
 class OwnerColumns:
-    """Columns of a thing of an owner."""
+    """The columns of every row that belongs to an owner."""
 
     owner: Mapped[str] = mapped_column(String(64), primary_key=True)
     id: Mapped[str] = mapped_column(String(64), primary_key=True)
@@ -98,7 +98,7 @@ class Change:
 
 
 class FileColumns(OwnerColumns):
-    """Columns of a thing of an owner that has a file in the store."""
+    """The columns of every row that belongs to an owner and has a file in the store."""
 
     file_sha256: Mapped[str] = mapped_column(String(64))
     bytes: Mapped[int] = mapped_column(BigInteger)

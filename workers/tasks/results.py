@@ -38,9 +38,20 @@ def psf_result(
 ) -> Result:
     """A draft PSF.
 
-    write: writes its file; None: `write_psf`. draw: draws its picture into a PNG file; None: the PSF and its curves.
-    channel: None: as the PSF says. details: further entries of its details. report: of its fit, as JSON. threads: for
-    its tables.
+    Parameters
+    ----------
+    write
+        Function that writes the file of the PSF; None: `write_psf`.
+    draw
+        Function that draws the picture of the PSF into a PNG file; None: the picture shows the PSF and its curves.
+    channel
+        Channel of the PSF; None: the channel that the PSF states.
+    details
+        Further entries of the details of the PSF.
+    report
+        Report of the fit, as JSON.
+    threads
+        Number of threads for the tables of the PSF.
     """
     channel = channel or channel_of(psf.instrument, psf.wavelength_angstrom)
     return Result(
@@ -94,9 +105,18 @@ def report_result(
     transit_id: str | None = None,
     about_id: str | None = None,
 ) -> Result:
-    """A report. content: its JSON. details: the entry "sentence" and the main figures; lists of reports show them.
-    draw, page: make its picture (PNG) and its page (HTML). transit_id, about_id: the transit, or the PSF or product,
-    that it is about.
+    """A report.
+
+    Parameters
+    ----------
+    content
+        JSON of the report.
+    details
+        The entry "sentence" and the main figures; lists of reports show them.
+    draw, page
+        Functions that make the picture (PNG) and the page (HTML) of the report.
+    transit_id, about_id
+        Id of the transit, or of the PSF or product, that the report describes.
     """
     files: dict[str, Write] = {"file": partial(write_json, content=content)}
     if draw is not None:

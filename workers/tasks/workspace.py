@@ -44,9 +44,17 @@ class TurnOver(Exception):
 class Result:
     """A result of a task, whose files are not yet written.
 
-    details: the entries that describe it. files: functions that write its files, by name: "file" is the result itself,
-    "preview" its picture (PNG), "html" its page. columns: the further columns of its row in a catalogue. figures: draws
-    the figures of the page (PNG).
+    Attributes
+    ----------
+    details
+        Entries that describe the result.
+    files
+        Functions that write the files, by name: "file" is the result itself, "preview" its picture (PNG), "html" its
+        page.
+    columns
+        Further columns of the row in a catalogue.
+    figures
+        Function that draws the figures of the page (PNG).
     """
 
     type: ResultType

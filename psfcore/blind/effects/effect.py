@@ -87,15 +87,34 @@ class Earlier:
 class EffectKind:
     """A kind of effect: the function `change` changes a step of the simulation.
 
-    group: one of KNOWN, CALIBRATION, TEST. families: the families of causes that are a right answer, the main one
-    first. unit: the unit of the strength. nominal: a strength whose change is visible in the discs. largest: the
-    largest plausible strength. draw: how each parameter is drawn. power: the residual that the effect leaves is
-    proportional to strength**power. varies: whether its optics differ from image to image. noise_realisations: number
-    of noise realisations over which its change is averaged; 0 if the change does not depend on noise. adds_light:
-    whether it adds light at places of the detector that stay the same; the truth then has a map of this light.
-    form_of: the effect of the gap library of which this withheld effect is another form. also: effects of the library
-    that it brings along, so that it is not wrong to name them. saturation_dn: the level in DN at which high-only
-    images clip, from the effect, all exposures and the plan.
+    Attributes
+    ----------
+    group
+        One of KNOWN, CALIBRATION, TEST.
+    families
+        The families of causes that are a right answer, the main one first.
+    unit
+        The unit of the strength.
+    nominal
+        A strength whose change is visible in the discs.
+    largest
+        The largest plausible strength.
+    draw
+        How each parameter is drawn.
+    power
+        The residual that the effect leaves is proportional to strength**power.
+    varies
+        Whether its optics differ from image to image.
+    noise_realisations
+        Number of noise realisations over which its change is averaged; 0 if the change does not depend on noise.
+    adds_light
+        Whether it adds light at places of the detector that stay the same; the truth then has a map of this light.
+    form_of
+        The effect of the gap library of which this withheld effect is another form.
+    also
+        Effects of the library that it brings along, so that it is not wrong to name them.
+    saturation_dn
+        The level in DN at which high-only images clip, from the effect, all exposures and the plan.
     """
 
     name: str

@@ -47,11 +47,21 @@ _LARGEST_BUILT_PX = 2048
 class Glass:
     """The known part of the PSF: the diffraction by a pupil and the orders of a mesh. Its sum is 1.
 
-    kind: SYNTHETIC, or the name of an instrument whose mount and meshes are built. size_px: size of the array in
-    detector pixels. The other fields describe a synthetic pattern. core_px, wing_px: the exponential scales of its
-    core and of its wing; the core is far narrower than a pixel, as in a real telescope at this wavelength.
-    wing_share, arm_share: the fractions of the light in the wing and in the orders of the mesh. pitch_px: the spacing
-    of the orders.
+    The fields after `size_px` describe a synthetic pattern.
+
+    Attributes
+    ----------
+    kind
+        SYNTHETIC, or the name of an instrument whose mount and meshes are built.
+    size_px
+        Size of the array in detector pixels.
+    core_px, wing_px
+        The exponential scales of the core and of the wing; the core is far narrower than a pixel, as in a real
+        telescope at this wavelength.
+    wing_share, arm_share
+        The fractions of the light in the wing and in the orders of the mesh.
+    pitch_px
+        The spacing of the orders.
     """
 
     kind: str

@@ -55,9 +55,18 @@ NEAR_MASKED_PX = 3
 class Structure:
     """Change, Eq. (1), of the brightest or darkest `tail_pct` percent of blocks of block_px x block_px.
 
-    kind: bright or dark. sum_pct: change of the summed light of these blocks. median_pct: median of their changes.
-    up_to_pct: percentile 99 of the changes of bright blocks, or percentile 1 of the changes of dark blocks.
-    before: mean of the blocks before deconvolution, in the unit of the image.
+    Attributes
+    ----------
+    kind
+        Bright or dark.
+    sum_pct
+        Change of the summed light of these blocks.
+    median_pct
+        Median of their changes.
+    up_to_pct
+        Percentile 99 of the changes of bright blocks, or percentile 1 of the changes of dark blocks.
+    before
+        Mean of the blocks before deconvolution, in the unit of the image.
     """
 
     kind: str
@@ -90,10 +99,19 @@ class Range:
 class Changes:
     """What a deconvolution changed in one image.
 
-    pixels: number of compared pixels. edge_px: width of the excluded band at the edges. change_pct: percentiles of the
-    change of single pixels, Eq. (1). difference: percentiles of after - before, in the unit of the image.
-    not_positive_before, not_positive_after: number of pixels that are not above zero, before and after deconvolution.
-    Eq. (1) is not defined for pixels that are not above zero before.
+    Attributes
+    ----------
+    pixels
+        Number of compared pixels.
+    edge_px
+        Width of the excluded band at the edges.
+    change_pct
+        Percentiles of the change of single pixels, Eq. (1).
+    difference
+        Percentiles of after - before, in the unit of the image.
+    not_positive_before, not_positive_after
+        Number of pixels that are not above zero, before and after deconvolution. Eq. (1) is not defined for pixels that
+        are not above zero before.
     """
 
     pixels: int

@@ -108,12 +108,28 @@ def whitening(covariance: Matrix) -> Matrix:
 class DiscCells:
     """The cells of one disc: their residuals and the derivatives of these residuals.
 
-    index: the number of the frame among all frames. residual: observed minus expected (cells,), DN/s. expected: the
-    light that the model predicts (cells,), DN/s. covariance: Eq. (2). jacobian: (columns, cells), DN/s for one unit of
-    a parameter. pixels, radius, azimuth: as in `Cells`. boxes: the sensitivities of the cells, and these times the
-    expected image, each summed over boxes of the detector (2, cells, rows, columns). scene: the mean of the occulted
-    scene in each box [y, x], DN/s. level_before: the value of `level` before the light of an effect was subtracted from
-    the image, DN/s; None if nothing was subtracted.
+    Attributes
+    ----------
+    index
+        The number of the frame among all frames.
+    residual
+        Observed minus expected (cells,), DN/s.
+    expected
+        The light that the model predicts (cells,), DN/s.
+    covariance
+        The covariance of the residuals, Eq. (2).
+    jacobian
+        The derivatives (columns, cells), DN/s for one unit of a parameter.
+    pixels, radius, azimuth
+        As in `Cells`.
+    boxes
+        The sensitivities of the cells, and these times the expected image, each summed over boxes of the detector (2,
+        cells, rows, columns).
+    scene
+        The mean of the occulted scene in each box [y, x], DN/s.
+    level_before
+        The value of `level` before the light of an effect was subtracted from the image, DN/s; None if nothing was
+        subtracted.
     """
 
     index: int

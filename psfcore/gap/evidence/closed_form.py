@@ -67,10 +67,24 @@ VISIBLE = 0.5  # errors of form count if they would add this much to chi2
 class Form:
     """One form of a cause: an effect of the library, a field, or the Sun, which has no columns.
 
-    family: its name in `tree.FAMILIES`, or that of an added effect. effect: the name of the library for this form; None
-    if it has none. columns: the numbers of its columns. likely: their likely sizes. positive: whether they cannot be
-    negative. squares: groups of its coefficients that can act without the others. everywhere: whether all of them can
-    act together. log_templates: ln of the number of templates that the data distinguish.
+    Attributes
+    ----------
+    family
+        The name of the family in `tree.FAMILIES`, or the family of an added effect.
+    effect
+        The name of the library for this form; None if it has none.
+    columns
+        The numbers of the columns of this form.
+    likely
+        The likely sizes of the coefficients of these columns.
+    positive
+        Whether these coefficients cannot be negative.
+    squares
+        Groups of coefficients that can act without the others.
+    everywhere
+        Whether all coefficients can act together.
+    log_templates
+        The ln of the number of templates that the data distinguish.
     """
 
     family: str

@@ -32,9 +32,19 @@ UNOCCULTED_WIDTH = 0.03
 class EffectFit:
     """The linear fit of one effect, or of several effects, together with the PSF.
 
-    values: value, error and unit of each parameter; the key is "parameter", or "effect.parameter" if there are several
-    effects. gain: the decrease of chi2. p_value: the p-value of the gain. step: the fit. model: the model that was
-    fitted.
+    Attributes
+    ----------
+    values
+        Value, error and unit of each parameter; the key is "parameter", or "effect.parameter" if there are several
+        effects.
+    gain
+        The decrease of chi2.
+    p_value
+        The p-value of the gain.
+    step
+        The fit.
+    model
+        The model that was fitted.
     """
 
     names: tuple[str, ...]

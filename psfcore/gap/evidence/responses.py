@@ -76,10 +76,26 @@ class Prior:
 class Evidence:
     """All the data that a diagnosis uses.
 
-    effects: the effects that these data can show. columns: the columns of each effect, by its name. base: the columns
-    that every fit contains. discs: the cells of each image that the fit used. image_info: the properties of every
-    image, used or not. untestable: the reasons why effects cannot be tested, by name. box_px: the edge of a box of
-    `DiscCells.boxes`. kernel: the total PSF, summed over boxes. templates: `Effect.distinguished` by effect.
+    Attributes
+    ----------
+    effects
+        The effects that these data can show.
+    columns
+        The columns of each effect, by its name.
+    base
+        The columns that every fit contains.
+    discs
+        The cells of each image that the fit used.
+    image_info
+        The properties of every image, used or not.
+    untestable
+        The reasons why effects cannot be tested, by name.
+    box_px
+        The edge of a box of `DiscCells.boxes`.
+    kernel
+        The total PSF, summed over boxes.
+    templates
+        The number of templates that the data distinguish (`Effect.distinguished`), by effect.
     """
 
     effects: tuple[Effect, ...]

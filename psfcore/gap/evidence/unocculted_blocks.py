@@ -41,12 +41,28 @@ LEAST_IMAGES = 3
 class UnoccultedBlocks:
     """The blocks of all images. Arrays have the shape (images, blocks) and the unit DN/s, if not stated otherwise.
 
-    levels: the mean of each block, with the hidden light added. variance: the variance of the noise plus the variance
-    of the floor, (DN/s)^2. free: whether a block is away from the disc and from filled pixels. means: the mean of each
-    block in the mean image of the pointing. errors: (columns, images, blocks), the change by one unit of the parameter
-    of each column. pointing: (images,). kind: (images,), one number for each combination of pointing, gain mode and
-    exposure. part: (images,), whether an image is used. across: the number of blocks in a row of blocks.
-    given_gain_width: the width of the prior of g_n; None: the spread of g_n in these images.
+    Attributes
+    ----------
+    levels
+        The mean of each block, with the hidden light added.
+    variance
+        The variance of the noise plus the variance of the floor, (DN/s)^2.
+    free
+        Whether a block is away from the disc and from filled pixels.
+    means
+        The mean of each block in the mean image of the pointing.
+    errors
+        The change (columns, images, blocks) by one unit of the parameter of each column.
+    pointing
+        The number of the pointing of each image, (images,).
+    kind
+        The kind of each image, (images,): one number for each combination of pointing, gain mode and exposure.
+    part
+        Whether each image is used, (images,).
+    across
+        The number of blocks in a row of blocks.
+    given_gain_width
+        The width of the prior of g_n; None: the spread of g_n in these images.
     """
 
     levels: Matrix
@@ -154,10 +170,20 @@ class UnoccultedBlocks:
 class UnoccultedEquations:
     """Normal equations of some columns, with brightness and scene eliminated.
 
-    normal: the normal matrix. score: the right-hand side. chi2: after the fit of scene and brightness alone, without
-    the columns. freedom: degrees of freedom of this chi2, if the brightness of every image is free. independent: the
-    same with the prior of the brightness, which leaves it less free. gains: the fitted g_n of each image, without the
-    columns.
+    Attributes
+    ----------
+    normal
+        The normal matrix.
+    score
+        The right-hand side.
+    chi2
+        The chi2 after the fit of scene and brightness alone, without the columns.
+    freedom
+        Degrees of freedom of this chi2, if the brightness of every image is free.
+    independent
+        The same with the prior of the brightness, which leaves it less free.
+    gains
+        The fitted g_n of each image, without the columns.
     """
 
     normal: Matrix

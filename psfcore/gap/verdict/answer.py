@@ -128,10 +128,22 @@ class Cause:
 class Answer:
     """The answer of a diagnosis.
 
-    causes: the first cause, and those that act beside it; empty if no gap is detected. verdict, named: as in the table
-    above. none: the probability of no cause. hypotheses: of each set of labels, the most probable first.
-    variants, evidence: the best variant of each form, and the ln E of each form alone. closed: the closed form with the
-    final noise. level: the probability of a group.
+    Attributes
+    ----------
+    causes
+        The first cause, and those that act beside it; empty if no gap is detected.
+    verdict, named
+        As in the table above.
+    none
+        The probability of no cause.
+    hypotheses
+        The probability of each set of labels, the most probable first.
+    variants, evidence
+        The best variant of each form, and the ln E of each form alone.
+    closed
+        The closed form with the final noise.
+    level
+        The probability of a group.
     """
 
     causes: tuple[Cause, ...]

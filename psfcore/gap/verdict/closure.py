@@ -67,11 +67,21 @@ class Interval:
 class HeldOut:
     """The results of a scheme of folds, for each held-out image with a disc. Images that no fold holds out are missing.
 
-    chi2, unocculted_chi2: chi2 of the cells, and of the blocks of the unocculted field. expected, unocculted_expected:
-    the values of the two chi2 without a gap. residual_pct: the mean of the disc, simulated minus observed, divided by
-    the observed mean. noise_pct: the error of this residual, including the error of the fit. deviance: Eq. (4) of each
-    fold; the key is the tuple of its held-out images. spread: for each fold, the parts of chi2 that independent errors
-    of its fit add on average, in the discs and in discs and blocks together.
+    Attributes
+    ----------
+    chi2, unocculted_chi2
+        Chi2 of the cells, and of the blocks of the unocculted field.
+    expected, unocculted_expected
+        The values of the two chi2 without a gap.
+    residual_pct
+        The mean of the disc, simulated minus observed, divided by the observed mean.
+    noise_pct
+        The error of this residual, including the error of the fit.
+    deviance
+        Eq. (4) of each fold; the key is the tuple of its held-out images.
+    spread
+        For each fold, the parts of chi2 that independent errors of its fit add on average, in the discs and in discs
+        and blocks together.
     """
 
     images: tuple[int, ...]

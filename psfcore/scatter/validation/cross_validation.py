@@ -259,11 +259,22 @@ class ShellBands:
     """The free fits and the formulas of all samples, shell by shell.
 
     Arrays (5, shells) contain percentiles over the samples, at -2, -1, 0, +1 and +2 sigma. "law" stands for the
-    formula. edges_px: edges of the shells, (shells + 1,). free_weight, law_weight: weight per pixel of each shell, (5,
-    shells). free_beyond_pct, law_beyond_pct: percentage of the light that is scattered beyond the inner edge of each
-    shell, (5, shells). excess_pct: excess of Eq. (2) within the outer edge of each shell, in percentage points of all
-    light, (5, shells). excess_sigma: error of the excess, (shells,). law_within_pct: median of the formula's light
-    within the outer edge of each shell, (shells,).
+    formula.
+
+    Attributes
+    ----------
+    edges_px
+        Edges of the shells, (shells + 1,).
+    free_weight, law_weight
+        Weight per pixel of each shell, (5, shells).
+    free_beyond_pct, law_beyond_pct
+        Percentage of the light that is scattered beyond the inner edge of each shell, (5, shells).
+    excess_pct
+        Excess of Eq. (2) within the outer edge of each shell, in percentage points of all light, (5, shells).
+    excess_sigma
+        Error of the excess, (shells,).
+    law_within_pct
+        Median of the formula's light within the outer edge of each shell, (shells,).
     """
 
     edges_px: Vector
@@ -342,9 +353,18 @@ class Excess:
 class Bands:
     """Medians and bands of all samples: percentiles at -2, -1, 0, +1 and +2 sigma.
 
-    curve_pct: percentiles of C(R) at radii_px, (5, radii). values: percentiles of each parameter, (5,). totals: the
-    total of scatter of each fit. held_out_pct: mean residual of each held-out image, percent. shells: percentiles by
-    shell; None if the formula is not isotropic.
+    Attributes
+    ----------
+    curve_pct
+        Percentiles of C(R) at radii_px, (5, radii).
+    values
+        Percentiles of each parameter, (5,).
+    totals
+        The total of scatter of each fit.
+    held_out_pct
+        Mean residual of each held-out image, percent.
+    shells
+        Percentiles by shell; None if the formula is not isotropic.
     """
 
     radii_px: Vector
