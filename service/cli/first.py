@@ -11,7 +11,7 @@ from shlex import quote
 from psfcore.files import FITS_ENDING
 from service.cli.progress import printable
 
-MOST_ENTRIES = 1000  # of a folder that are looked at
+MOST_ENTRIES, MOST_FOLDERS = 1000, 100  # that are looked at
 MOST_COMMANDS = 3
 HEADER_BYTES = 28_800  # ten blocks of a FITS file, 360 cards
 # Cards of files that are not images of a telescope: products of heliopsf, and PSFs.
@@ -38,29 +38,29 @@ def _fitting(folder: Path) -> Iterator[tuple[str, str]]:
     """Commands for what lies in the folder, and what they do: for transits, for images, and for folders of images."""
     entries = sorted(islice(folder.iterdir(), MOST_ENTRIES))
     folders = [one for one in entries if one.is_dir() and not one.name.startswith(".") and readable(one)]
-    places = [folder, *folders]
+    places = [folder, *folders[:MOST_FOLDERS]]
     transits = [place for place in places if (place / "transit.json").is_file()]
     for place in transits[:1]:
         name = _name(place, folder)
         yield f"heliopsf report {name} -o report.html --local", "fits a PSF to the transit and tests it"
         yield f"heliopsf gap {name} -o gap.html --local", "finds why a fitted PSF and the transit differ"
     for place in places:
-        images = [] if place in transits else _images(place)
+        images = [] if place in transits else list(islice(_images(place), 2))
         if len(images) == 1:
             name, output = _name(images[0], folder), quote(f"{_stem(images[0])}-deconvolved.fits")
             yield f"heliopsf deconvolve {name} -o {output} --local", "deconvolves the image"
         elif images:
             yield (
                 f"heliopsf deconvolve {_name(place, folder)} -o deconvolved/ --local",
-                f"deconvolves {len(images)} images",
+                "deconvolves the images of the folder",
             )
 
 
-def _images(folder: Path) -> list[Path]:
+def _images(folder: Path) -> Iterator[Path]:
     """FITS files of a folder that can be images of a telescope, by the endings of their names and by their headers."""
     entries = sorted(islice(folder.iterdir(), MOST_ENTRIES))
-    named = [one for one in entries if FITS_ENDING.search(one.name) and not one.name.startswith(".")]
-    return [one for one in named if one.is_file() and readable(one) and _can_be_image(one)]
+    named = (one for one in entries if FITS_ENDING.search(one.name) and not one.name.startswith("."))
+    return (one for one in named if one.is_file() and readable(one) and _can_be_image(one))
 
 
 def readable(path: Path) -> bool:
