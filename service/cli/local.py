@@ -74,8 +74,14 @@ _NOW = "now"  # the context that a service without contexts has too
 
 @dataclass
 class Local(Operations):
-    """The requests of a command. folder: for temporary files. gap_effects: files and modules that add effects to the
-    gap library.
+    """The requests of a command.
+
+    Attributes
+    ----------
+    folder
+        A folder for temporary files.
+    gap_effects
+        Files and modules that add effects to the gap library.
     """
 
     folder: Path
@@ -297,6 +303,6 @@ class Local(Operations):
 
 @contextmanager
 def local(*, gap_effects: str = "") -> Iterator[Local]:
-    """The operations of a command with ``--local``. gap_effects: as in the setting HELIOPSF_GAP_EFFECTS."""
+    """The operations of a command with ``--local``; ``gap_effects`` is as in the setting HELIOPSF_GAP_EFFECTS."""
     with TemporaryDirectory(prefix="heliopsf-") as folder:
         yield Local(Path(folder), gap_effects)

@@ -53,9 +53,15 @@ class ServiceError(Exception):
 
 
 def error_lines(message: str, fields: Mapping[str, Any], *, local: bool) -> list[str]:
-    """An error as lines to print. If the telescope of an image is unknown: why, and the two ways that exist here.
+    """An error as lines to print. If the telescope of an image is unknown, the lines say why, and name the two ways to
+    get a PSF.
 
-    local: whether the command runs without a service.
+    Parameters
+    ----------
+    fields
+        The further fields of the error.
+    local
+        Whether the command runs without a service.
     """
     if not fields.get("ways"):
         return [message]
@@ -99,7 +105,7 @@ class Patience:
         self.answered()
 
     def answered(self, news: str = "the service answers again") -> None:
-        """Begin to count anew. news: the message if answers were missing before."""
+        """Begin to count anew. If answers were missing before, the message ``news`` is sent."""
         self._since, self._wait_s = time.monotonic(), FIRST_WAIT_S
         if self._lost:
             self._say(news)
