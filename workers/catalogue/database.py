@@ -179,8 +179,12 @@ def newest_first(
 ) -> Select[*Columns]:
     """A page of a query for rows of a table, newest first.
 
-    dates: the columns created_at and id of the table.
-    after: (created_at, id) of the last row of the previous page; None for the first page.
+    Parameters
+    ----------
+    dates
+        The columns created_at and id of the table.
+    after
+        (created_at, id) of the last row of the previous page; None for the first page.
     """
     if after is not None:
         query = query.where(tuple_(*dates) < after)

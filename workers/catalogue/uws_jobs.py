@@ -135,7 +135,12 @@ class UwsJobs:
     ) -> list[JobLine]:
         """The newest ``last`` jobs of an owner, newest first.
 
-        phases: only jobs in these phases; empty: all. from_time: only jobs created at this time or later.
+        Parameters
+        ----------
+        phases
+            The phases of the jobs; empty: all phases.
+        from_time
+            The earliest time at which the jobs were created, in seconds since 1970; None: any time.
         """
         query = select(JobRow.id, JobRow.phase, JobRow.owner, JobRow.created_at, TermsRow.run_id)
         query = query.outerjoin(TermsRow, TermsRow.job_id == JobRow.id).where(JobRow.owner == owner)
