@@ -37,8 +37,15 @@ Thing = TypeVar("Thing")
 
 
 class _Id(click.ParamType):
-    """An id, or its first digits. or_file: or the name of a file with a PSF. or_instrument: or an instrument, whose PSF
-    is built: its name, or its file (TOML); or the name of a published PSF.
+    """The type of an option or argument for an id, or the first digits of an id.
+
+    Parameters
+    ----------
+    or_file
+        Whether the name of a file with a PSF is accepted too.
+    or_instrument
+        Whether an instrument, whose PSF is built, is accepted too (its name, or its file in TOML), or the name of a
+        published PSF.
     """
 
     name = "id"

@@ -215,8 +215,14 @@ class Local(Operations):
     def convolve(
         self, image_id: str, edges: KnownScene, report: Progress, **named: object
     ) -> tuple[Convolved, UsedPsf]:
-        """Convolve an image with a PSF; returns also how cards name the PSF. named: further fields of the request for a
-        deconvolution of the image, such as ``psf_id``.
+        """Convolve an image with a PSF; returns also how cards name the PSF.
+
+        Parameters
+        ----------
+        edges
+            The scene beyond the edges of the image: "zero" or "symmetric".
+        **named
+            Further fields of the request for a deconvolution of the image, such as ``psf_id``.
         """
         request = self._resolved_deconvolution(
             Deconvolve.model_validate({"image_id": image_id, "again": True, **named})

@@ -236,7 +236,12 @@ class UploadKind(Generic[Row]):
 class RequestFile:
     """A file of a request, which is written to a temporary path and hashed while it arrives.
 
-    filename: the name that the client gives to the file. bytes: the number of bytes that have arrived.
+    Attributes
+    ----------
+    filename
+        The name that the client gives to the file.
+    bytes
+        The number of bytes that have arrived.
     """
 
     def __init__(self, path: Path) -> None:

@@ -86,7 +86,13 @@ def _bad(message: str) -> Problem:
 
 
 class _Parts:
-    """The parts of a form. whole: whether the end of the form has arrived."""
+    """The parts of a form.
+
+    Attributes
+    ----------
+    whole
+        Whether the end of the form has arrived.
+    """
 
     def __init__(self, boundary: bytes) -> None:
         self.whole = False

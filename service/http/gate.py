@@ -45,7 +45,7 @@ class _Queue:
 
 
 class Gate:
-    """Gives places to the work of owners in turn. now: a clock, s."""
+    """Gives places to the work of owners in turn. The function ``now`` is a clock, s."""
 
     def __init__(self, places: int, now: Callable[[], float] = time.monotonic) -> None:
         """Let ``places`` works run at the same time, at least 2."""

@@ -99,10 +99,23 @@ class Follower:
     """A stream of the events of one job or bulk run, until it reaches its final state or is deleted, as the lookout of
     its owner sees it.
 
-    caller: whose key must stay valid. known: the versions that the client knows; "": none yet; None: the deletion.
-    whole: whether the stream follows all jobs and bulk runs of the owner, or only those in ``known``. after: as in
-    ``Sight``; None: the last seconds. begun: whether it has looked. joined: whether its own looks have ended, so that
-    the lookout looks for it too. said: the texts that the client has not got yet.
+    Attributes
+    ----------
+    caller
+        The caller whose key must stay valid.
+    known
+        The versions that the client knows; "": it knows none yet; None: it knows that the job or bulk run was deleted.
+    whole
+        Whether the stream follows all jobs and bulk runs of the owner, or only those in ``known``.
+    after
+        For each kind, the row after which the next look continues, as in ``Sight``; None: the next look reads the
+        changes of the last seconds.
+    begun
+        Whether the follower has looked at the database.
+    joined
+        Whether the follower's own looks have ended, so that the lookout looks for it too.
+    said
+        The texts that the client has not got yet.
     """
 
     whole = False
@@ -145,7 +158,13 @@ class Follower:
 
 
 class OwnerFollower(Follower):
-    """A stream of the events of all jobs and bulk runs of an owner. named: those that the request names."""
+    """A stream of the events of all jobs and bulk runs of an owner.
+
+    Attributes
+    ----------
+    named
+        The jobs and bulk runs that the request names.
+    """
 
     whole = True
 

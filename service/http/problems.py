@@ -118,7 +118,7 @@ class Problem(HTTPException):
 
 
 def problem(error: DataError, **more: object) -> Problem:
-    """The HTTP error for a DataError, with the same code, message and fields. more: fields to add."""
+    """The HTTP error for a DataError, with the same code, message and fields, and the further fields in ``more``."""
     return Problem(
         STATUS_OF.get(error.code, 422), error.code, error.message, headers=None, **{**error.fields, **more}
     )
