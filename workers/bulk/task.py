@@ -64,9 +64,9 @@ class _Reading:
     Attributes
     ----------
     item
-        The row of the image in the run; None if no image is left.
+        The row of the image in the run; None if there was no image to take.
     image
-        The image itself, and the time that reading took, s.
+        The image itself, and the time that reading took, s; None if there was no image to take.
     """
 
     item: Future[BulkItemRow | None]

@@ -27,7 +27,7 @@ class Pace:
     taken
         Number of images that workers process now.
     images_an_hour
-        Number of images that end per hour; None if not known.
+        Number of images that ended per hour; None if not known.
     """
 
     taken: int

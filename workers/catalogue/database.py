@@ -71,7 +71,10 @@ def _now_of_sqlite(*_: object, **__: object) -> str:
 class Database:
     """An engine and its sessions. ``writing`` takes SQLite's write lock at the start; ``reading`` takes no lock.
 
-    now: the time of the database's clock, as an SQL expression.
+    Attributes
+    ----------
+    now
+        The time of the database's clock, as an SQL expression.
     """
 
     now = Now()

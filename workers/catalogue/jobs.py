@@ -308,8 +308,8 @@ class Jobs(Queries):
         limit
             The largest number of jobs that are returned.
         idle
-            Whether there are workers that do nothing. The waiting time then does not double, because a worker would
-            have taken a message that the broker still had.
+            Whether there are workers, and all of them do nothing. The waiting time then does not double, because a
+            worker would have taken a message that the broker still had.
         """
         waits = {number: resubmit_s * 2.0 ** max(0, number - 1) for number in range(9)}
         growing_s = case(waits, value=JobRow.submissions, else_=resubmit_s * 2.0**8)

@@ -115,7 +115,13 @@ class Usage:
 
 
 class OverQuota(Exception):
-    """A file does not fit into the owner's quota. usage: the owner's usage without it."""
+    """A file does not fit into the owner's quota.
+
+    Attributes
+    ----------
+    usage
+        The owner's usage without this file.
+    """
 
     def __init__(self, usage: Usage) -> None:
         super().__init__(usage.owner)

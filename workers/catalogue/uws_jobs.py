@@ -39,7 +39,12 @@ class UwsJobs:
     def draft(self, kind: str, given: Mapping[str, object], *, owner: str, **terms: object) -> JobRow:
         """Create a PENDING job with the parameters ``given`` so far. Identical requests do not share it.
 
-        terms: the columns of its ``TermsRow``.
+        Parameters
+        ----------
+        given
+            The parameters that the client has given.
+        **terms
+            The columns of the job's ``TermsRow``.
         """
         job_id = uuid.uuid4().hex
         row = JobRow(

@@ -75,7 +75,8 @@ class Kind:
     Attributes
     ----------
     task, assistant
-        Dotted names of functions. Other workers run the assistant when a job asks for help; None: they cannot help.
+        Dotted names of functions. Other workers run the assistant when a job asks for help; if ``assistant`` is None,
+        they cannot help.
     result
         Type of the result.
     parameters, resolved

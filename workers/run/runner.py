@@ -133,7 +133,7 @@ class Runner:
             self._keep_times(job, assistance.times)
 
     def _workspace(self, job: JobRow, work: Attempt | Assistance, **functions: Any) -> CatalogueWorkspace:
-        """The workspace of a task or an assistant. functions: what only a task may use."""
+        """The workspace of a task or an assistant. Only a task may use the ``functions``."""
         return CatalogueWorkspace(
             catalogue=self._catalogue,
             store=self._store,
