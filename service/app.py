@@ -57,8 +57,11 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
     """Make the application for these settings. When it starts, it upgrades the tables of the database and starts the
     reconciler.
 
-    bound_to: the address on which it listens. If the settings do not say whether requests need a key, this address
-    decides.
+    Parameters
+    ----------
+    bound_to
+        The address on which the application listens. If the settings do not say whether requests need a key, this
+        address decides.
     """
     access, rates = Access.of(settings, bound_to), Rates(settings)
 

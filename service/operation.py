@@ -199,8 +199,13 @@ class _Catalogued(Collector):
 
 
 def _gauge(name: str, description: str, values: float | Mapping[Labels, float], *labels: str) -> Metric:
-    """A gauge. values: its value, or the values by the value of the label, or by a tuple of the values of the
-    labels.
+    """A gauge.
+
+    Parameters
+    ----------
+    values
+        The value of the gauge; or its values by the value of the label; or its values by a tuple of the values of all
+        labels.
     """
     gauge = GaugeMetricFamily(f"heliopsf_{name}", description, labels=labels)
     return _filled(gauge, values if isinstance(values, Mapping) else {(): values})

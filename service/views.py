@@ -100,7 +100,12 @@ class JobView(RowView):
     def of(cls, row: JobRow, waiting_before: int | None = None, *, result_deleted: bool = False) -> JobView:
         """The description of a job, from its row in the catalogue.
 
-        waiting_before: number of jobs that wait before this job; None if they were not counted.
+        Parameters
+        ----------
+        waiting_before
+            Number of jobs that wait before this job; None if they were not counted.
+        result_deleted
+            Whether the result of the job was deleted.
         """
         return cls.of_columns(
             row,
@@ -117,7 +122,11 @@ def time_left_s(row: JobRow, now: float | None = None) -> float | None:
 
     If the steps count the whole job, the estimate uses the speed since the job began to count its present steps.
     Earlier work, such as reading the images, does not count. Otherwise it is the rest of the estimated time of the job.
-    now: seconds since 1970; default: this machine's clock.
+
+    Parameters
+    ----------
+    now
+        The time in seconds since 1970; default: the time of this machine's clock.
     """
     now = time.time() if now is None else now
     if not KINDS[row.kind].counted_whole:
@@ -133,7 +142,12 @@ def time_left_s(row: JobRow, now: float | None = None) -> float | None:
 
 def share_of_time(row: JobRow, now: float | None = None) -> float | None:
     """The share of its estimated time that a running job has used; None if its steps count the whole job, if the
-    estimate is not known or has passed, or if the stage has no steps. now: as for `time_left_s`.
+    estimate is not known or has passed, or if the stage has no steps.
+
+    Parameters
+    ----------
+    now
+        The time in seconds since 1970; default: the time of this machine's clock.
     """
     if KINDS[row.kind].counted_whole or row.phase != Phase.EXECUTING or row.started_at is None:
         return None
@@ -172,7 +186,10 @@ class ProductView(RowView):
     def of(cls, row: ProductRow, details: dict[str, object] | None = None) -> ProductView:
         """The description of a product, from its row in the catalogue.
 
-        details: the current details of the product; default: the details in the row.
+        Parameters
+        ----------
+        details
+            The current details of the product; default: the details in the row.
         """
         here = f"/v1/products/{row.id}"
         return cls.of_columns(

@@ -138,7 +138,9 @@ class Seldom(logging.Filter):
     def __init__(
         self, about: Callable[[logging.LogRecord], bool] = lambda _record: True, every_s: float = 60.0
     ) -> None:
-        """about: selects the records to which the limit applies; all other records are written."""
+        """Limit the records that ``about`` selects to one of each kind in ``every_s`` seconds; all other records are
+        written.
+        """
         super().__init__()
         self._about, self._every_s = about, every_s
         self._said: dict[tuple[str, str], tuple[float, int]] = {}

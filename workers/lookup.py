@@ -42,7 +42,14 @@ def row_of(catalogue: Catalogue, table: type[Row], identity: str, owner: str) ->
 def no_such(thing: str, given: str, *, shortened: bool = False) -> DataError:
     """The error for an id that nothing of the owner has.
 
-    thing: a key of ``NAMES``. shortened: the first digits of an id would also have been accepted.
+    Parameters
+    ----------
+    thing
+        A key of ``NAMES``.
+    given
+        The id that was received.
+    shortened
+        Whether the first digits of an id would also have been accepted.
     """
     names = f"{NAMES[thing]}s"
     digits = f", or its first {FEWEST_DIGITS} or more digits" if shortened else ""

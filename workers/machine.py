@@ -35,7 +35,12 @@ def cores() -> int:
 def memory_bytes(cgroups: Path = CGROUPS, membership: Path = MEMBERSHIP) -> int:
     """Memory that this process may use, bytes: the smallest of the machine's memory and the limits of its cgroups.
 
-    cgroups: where the system shows the limits of cgroups. membership: the file that names the cgroups of this process.
+    Parameters
+    ----------
+    cgroups
+        The folder in which the system shows the limits of cgroups.
+    membership
+        The file that names the cgroups of this process.
     """
     machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     return min([machine, *(cgroup.limit for cgroup in _limits(cgroups, membership))])
@@ -44,8 +49,12 @@ def memory_bytes(cgroups: Path = CGROUPS, membership: Path = MEMBERSHIP) -> int:
 def free_bytes(cgroups: Path = CGROUPS, membership: Path = MEMBERSHIP, meminfo: Path = MEMINFO) -> int:
     """Memory that this process may use in addition to what it holds, bytes. Caches that the system can drop are free.
 
-    cgroups, membership: see ``memory_bytes``. meminfo: the file in which the system shows its free memory; without it,
-    all memory counts as free.
+    Parameters
+    ----------
+    cgroups, membership
+        The same folder and file as for ``memory_bytes``.
+    meminfo
+        The file in which the system shows its free memory; without this file, all memory counts as free.
     """
     shown = re.search(r"^MemAvailable:\s*(\d+) kB$", _text(meminfo), re.MULTILINE)
     machine = memory_bytes(cgroups, membership) if shown is None else 1024 * int(shown[1])

@@ -22,9 +22,17 @@ _exporter: Sender | None = None
 
 
 def configure(settings: Settings, part: str) -> None:
-    """Switch traces on if the settings say so. part: "server" or "worker".
+    """Switch traces on if the settings say so.
 
-    Raises ``psfcore.errors.MissingExtra`` if the packages of the extra "traces" are missing.
+    Parameters
+    ----------
+    part
+        "server" or "worker".
+
+    Raises
+    ------
+    psfcore.errors.MissingExtra
+        The packages of the extra "traces" are missing.
     """
     global _exporter
     if settings.traces_url is not None and _exporter is None:
@@ -40,7 +48,7 @@ def shutdown() -> None:
 
 
 def of_request(headers: Mapping[str, str]) -> AbstractContextManager[None]:
-    """The span of a request, if traces are on. headers: may name the span of the client (``traceparent``)."""
+    """The span of a request, if traces are on. The ``headers`` may name the span of the client (``traceparent``)."""
     return nullcontext() if _exporter is None else _exporter.request(headers)
 
 
@@ -50,6 +58,14 @@ def of_job(job_id: str, kind: str) -> AbstractContextManager[None]:
 
 
 def note(attributes: Mapping[str, Attribute], *, name: str | None = None, failed: str | None = None) -> None:
-    """Add attributes to the current span, if traces are on. name: its new name. failed: why it failed."""
+    """Add attributes to the current span, if traces are on.
+
+    Parameters
+    ----------
+    name
+        The new name of the span.
+    failed
+        Why the work of the span failed.
+    """
     if _exporter is not None:
         _exporter.note(attributes, name=name, failed=failed)

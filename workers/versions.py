@@ -92,8 +92,17 @@ def variant_for(cards: Cards, channels: Iterable[str]) -> str | None:
     """The channel, of these variants, to which an image belongs; None if no variant agrees with the image.
 
     All properties of the variant agree with the header of the image; if several variants agree, the image belongs to
-    the one with the most properties. cards: header cards of the image. Raises ``DataError`` "several-variants-fit" if
-    two variants agree equally well.
+    the one with the most properties.
+
+    Parameters
+    ----------
+    cards
+        The header cards of the image.
+
+    Raises
+    ------
+    DataError
+        "several-variants-fit" if two variants agree equally well.
     """
     properties = {channel: channel.split(SEPARATOR)[1:] for channel in channels}
     agreeing = [one for one, needed in properties.items() if all(_has(cards, name) for name in needed)]
@@ -192,7 +201,8 @@ FEWEST_STEPS = 64
 def seconds(text: str, name: str = "time") -> float:
     """Convert a time such as 2024-03-01T12:00:00Z to seconds since 1970. A date means the start of that day.
 
-    A time without a zone is in UTC. name: name of the field, for the message. Raises ``DataError`` "bad-time".
+    A time without a zone is in UTC. The message of the error, ``DataError`` "bad-time", contains the ``name`` of the
+    field.
     """
     if not _TIME.fullmatch(text):
         raise bad_time(text, name)

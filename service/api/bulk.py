@@ -391,7 +391,9 @@ def get_results(
 def _in_order(
     progress: BulkProgress, bulk_id: str, order: str, limit: int | None, warning: str | None
 ) -> Iterator[list[Result]]:
-    """Results in batches; each batch is one query. warning: see `get_results`."""
+    """Results of a bulk run in batches; each batch is one query. If ``warning`` is the code of a warning, only results
+    with this warning.
+    """
     left = limit
     after, behind = -1, None
     while left is None or left > 0:

@@ -161,8 +161,12 @@ async def prepare_image(state: State, owner: str, digest: str) -> None:
 async def picture_of(
     request: Request, state: State, owner: str, digest: str, core_px: int | None = None
 ) -> Response:
-    """A picture of the image in a stored file as PNG, or 304 if the client already has it. core_px: of the central part
-    of a PSF, with this width.
+    """A picture of the image in a stored file as PNG, or 304 if the client already has it.
+
+    Parameters
+    ----------
+    core_px
+        Width of the central part of a PSF of which the picture is made; None: the picture shows the whole image.
     """
     sent = files.headers_of(f"{ANSWERS_VERSION} {digest} picture {core_px}")
     if (same := files.not_modified(request, sent)) is not None:

@@ -257,7 +257,7 @@ def _wait(service: Client, bulk_id: str) -> Bulk:
 
 
 def _end(run: Bulk, wait: bool) -> None:
-    """Print the state of a run. wait: exit with status 1 if the run is not completed or if an image failed."""
+    """Print the state of a run. With ``wait``, exit with status 1 if the run is not completed or if an image failed."""
     _print_run(run)
     if wait and (run["phase"] != "COMPLETED" or run["images"]["failed"]):
         sys.exit(1)

@@ -37,8 +37,15 @@ Thing = TypeVar("Thing")
 
 
 class _Id(click.ParamType):
-    """An id, or its first digits. or_file: or the name of a file with a PSF. or_instrument: or an instrument, whose PSF
-    is built: its name, or its file (TOML); or the name of a published PSF.
+    """The type of an option or argument for an id, or the first digits of an id.
+
+    Parameters
+    ----------
+    or_file
+        Whether the name of a file with a PSF is accepted too.
+    or_instrument
+        Whether an instrument, whose PSF is built, is accepted too (its name, or its file in TOML), or the name of a
+        published PSF.
     """
 
     name = "id"
@@ -71,10 +78,16 @@ class _Id(click.ParamType):
 
 
 def server_option(what: str, *, or_local: bool = False) -> Callable[[Command], Command]:
-    """The options ``--server`` and ``--key`` of a command that can send a request to a service; or_local: and
-    ``--local``.
+    """The options ``--server`` and ``--key`` of a command that can send a request to a service.
 
     The command does not get their values: `connection`, `remote` and `is_local` find them in the context.
+
+    Parameters
+    ----------
+    what
+        The help text of ``--server``, without the default.
+    or_local
+        Whether the command also has the option ``--local``.
     """
     key = kept(_KEY)(
         "--key",
@@ -94,7 +107,9 @@ def server_option(what: str, *, or_local: bool = False) -> Callable[[Command], C
 def psf_option(
     what: str, *, required: bool = False, or_instrument: bool = False
 ) -> Callable[[Command], Command]:
-    """The option ``--psf``. what: what the command does with the PSF, and its default."""
+    """The option ``--psf``. Its help text ``what`` says what the command does with the PSF, and which PSF is the
+    default.
+    """
     kind = _Id(or_file=True, or_instrument=or_instrument)
     metavar = "ID|FILE|NAME" if or_instrument else "ID|FILE"
     return click.option("--psf", type=kind, metavar=metavar, required=required, help=what)
@@ -149,14 +164,20 @@ def on_service(command: Command) -> Command:
 
 
 def print_rows(rows: Iterable[Thing], line: Callable[[Thing], str], *, if_none: str) -> None:
-    """Print a line for each row of a list. if_none: what to print if there are no rows."""
+    """Print a line for each row of a list, or the text ``if_none`` if there are no rows."""
     lines = [line(row).rstrip() for row in rows]
     echo("\n".join(lines or [if_none]))
 
 
 @contextmanager
 def connection(*, gap_effects: str = "") -> Iterator[Operations]:
-    """A service over HTTP, or with ``--local`` this process. gap_effects: further effects for a local diagnosis."""
+    """A service over HTTP, or with ``--local`` this process.
+
+    Parameters
+    ----------
+    gap_effects
+        Files and modules that add effects to the gap library in a diagnosis with ``--local``.
+    """
     if not is_local():
         with remote() as service:
             service.health()
@@ -176,7 +197,12 @@ def is_psf_id(psf: str) -> bool:
 def whole_id(service: Operations, things: str, identity: str) -> str:
     """Find the whole id of a PSF, product, job, ... from the first digits of the id.
 
-    things: the type as it is written in the address, for example "psfs".
+    Parameters
+    ----------
+    things
+        The type as it is written in the address, for example "psfs".
+    identity
+        The whole id, or its first digits.
     """
     if len(identity) == DIGITS:
         return identity
@@ -198,10 +224,18 @@ def psf_file(psf: str) -> Iterator[Path]:
 
 
 def named_psf(service: Operations, psf: str | None, *, image: Path | None = None) -> str | None:
-    """The id of the PSF that the user named with ``--psf``; a file is uploaded first, the PSF of an instrument is
-    built, and a published PSF is uploaded if the service has none of this name.
+    """The id of the PSF that the user named with ``--psf``; None if the user named none.
 
-    image: the first image of the command, whose published PSF "published" means; None: the command has no image.
+    A file is uploaded first, the PSF of an instrument is built, and a published PSF is uploaded if the service has none
+    of this name.
+
+    Parameters
+    ----------
+    psf
+        The value of ``--psf``; None: the option was not given.
+    image
+        The first image of the command: "published" means the published PSF of this image. None: the command has no
+        image.
     """
     if psf is None:
         return None

@@ -62,7 +62,15 @@ OTHER_REVISIONS: dict[str, tuple[State, str]] = {
 
 @dataclass(frozen=True)
 class Finding:
-    """The result of a check. found: the observation. advice: what to do; may be empty."""
+    """The result of a check.
+
+    Attributes
+    ----------
+    found
+        The observation.
+    advice
+        What the user should do; empty if there is nothing to do.
+    """
 
     state: State
     found: str

@@ -74,8 +74,14 @@ _NOW = "now"  # the context that a service without contexts has too
 
 @dataclass
 class Local(Operations):
-    """The requests of a command. folder: for temporary files. gap_effects: files and modules that add effects to the
-    gap library.
+    """The requests of a command.
+
+    Attributes
+    ----------
+    folder
+        A folder for temporary files.
+    gap_effects
+        Files and modules that add effects to the gap library.
     """
 
     folder: Path
@@ -209,8 +215,14 @@ class Local(Operations):
     def convolve(
         self, image_id: str, edges: KnownScene, report: Progress, **named: object
     ) -> tuple[Convolved, UsedPsf]:
-        """Convolve an image with a PSF; returns also how cards name the PSF. named: further fields of the request for a
-        deconvolution of the image, such as ``psf_id``.
+        """Convolve an image with a PSF; returns also how cards name the PSF.
+
+        Parameters
+        ----------
+        edges
+            The scene beyond the edges of the image: "zero" or "symmetric".
+        **named
+            Further fields of the request for a deconvolution of the image, such as ``psf_id``.
         """
         request = self._resolved_deconvolution(
             Deconvolve.model_validate({"image_id": image_id, "again": True, **named})
@@ -297,6 +309,6 @@ class Local(Operations):
 
 @contextmanager
 def local(*, gap_effects: str = "") -> Iterator[Local]:
-    """The operations of a command with ``--local``. gap_effects: as in the setting HELIOPSF_GAP_EFFECTS."""
+    """The operations of a command with ``--local``; ``gap_effects`` is as in the setting HELIOPSF_GAP_EFFECTS."""
     with TemporaryDirectory(prefix="heliopsf-") as folder:
         yield Local(Path(folder), gap_effects)

@@ -73,7 +73,7 @@ class ImageFile:
 
 @dataclass(frozen=True)
 class PsfFile(ImageFile):
-    """A PSF in a file. name, version: as products name it."""
+    """A PSF in a file, with the name and the version by which products name the PSF."""
 
     name: str
     version: str
@@ -114,8 +114,14 @@ class TransitFiles:
 class Inputs:
     """What the user added to a command, and what was made of it, by the ids that a service would give.
 
-    builds: PSFs that are built when they are needed. psfs_read: by id and whether with components; a PSF is read once.
-    results: by type and id.
+    Attributes
+    ----------
+    builds
+        PSFs that are built when they are needed.
+    psfs_read
+        PSFs that were read, by their id and whether they have their components; a PSF is read once.
+    results
+        The results that were made, by type and id.
     """
 
     images: dict[str, ImageFile] = field(default_factory=dict)

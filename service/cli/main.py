@@ -38,7 +38,10 @@ class Lazy(NamedTuple):
 class LazyGroup(click.Group):
     """Commands under headings. A command's file is imported when the command is called.
 
-    sections: the commands under each heading, by name.
+    Attributes
+    ----------
+    sections
+        The commands under each heading, by name.
     """
 
     def __init__(self, *args: Any, sections: Mapping[str, Mapping[str, Lazy]], **options: Any) -> None:

@@ -227,7 +227,7 @@ class OutputPath:
     is_folder: bool
 
     def file(self, name: str) -> Path:
-        """The path of the file. name: the file name to use if the place is a folder. The folder is made if needed.
+        """The path of the file: this path, or the file ``name`` in it if it is a folder. The folder is made if needed.
 
         The service may have chosen the name, so the file is always in the folder.
         """

@@ -59,7 +59,12 @@ def _reporting(
 ) -> Iterator[tuple[Operations, Path, Progress]]:
     """A service, the file for the numbers of its report, and the function that shows its progress.
 
-    json_file: None: the file is temporary. gap_effects: as in `connection`.
+    Parameters
+    ----------
+    json_file
+        The file for the numbers; None: a temporary file.
+    gap_effects
+        Files and modules that add effects to the gap library, as in `connection`.
     """
     with (
         TemporaryDirectory(prefix="heliopsf-") as folder,

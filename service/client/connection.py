@@ -59,7 +59,10 @@ class RequestOptions(TypedDict, total=False):
 class Connection:
     """The connection to a service. Every method raises ``ServiceError`` if a request fails; its ``code`` is the reason.
 
-    server: address of the service.
+    Attributes
+    ----------
+    server
+        Address of the service.
     """
 
     server: str
@@ -292,7 +295,7 @@ class Connection:
         params: Parameters | None = None,
         **options: Unpack[RequestOptions],
     ) -> AnyAnswer:
-        """The JSON that a request answers. _kind: its form."""
+        """The JSON that a request answers, as an object of the type ``_kind``."""
         body: AnyAnswer = self._answer(method, address, params=params, **options).json()
         return body
 

@@ -53,9 +53,15 @@ class ServiceError(Exception):
 
 
 def error_lines(message: str, fields: Mapping[str, Any], *, local: bool) -> list[str]:
-    """An error as lines to print. If the telescope of an image is unknown: why, and the two ways that exist here.
+    """An error as lines to print. If the telescope of an image is unknown, the lines say why, and name the two ways to
+    get a PSF.
 
-    local: whether the command runs without a service.
+    Parameters
+    ----------
+    fields
+        The further fields of the error.
+    local
+        Whether the command runs without a service.
     """
     if not fields.get("ways"):
         return [message]
@@ -76,8 +82,16 @@ def error_lines(message: str, fields: Mapping[str, Any], *, local: bool) -> list
 class WaitInterrupted(KeyboardInterrupt):
     """Control-C was pressed during a wait for a job or a bulk run. The job or bulk run continues without the client.
 
-    what: "job" or "bulk". identity: the id of the job or bulk run. server: address of the service. others: ids of
-    further jobs that continue.
+    Attributes
+    ----------
+    what
+        "job" or "bulk".
+    identity
+        The id of the job or bulk run.
+    server
+        Address of the service.
+    others
+        The ids of further jobs that continue.
     """
 
     def __init__(self, what: str, identity: str, server: str, others: tuple[str, ...] = ()) -> None:
@@ -91,7 +105,12 @@ class WaitInterrupted(KeyboardInterrupt):
 class Patience:
     """How long a client repeats a request that got no answer: at growing intervals, for up to 10 minutes.
 
-    say: gets a message when the answers stop, and when they begin again. goes_on: what happens in the meantime.
+    Parameters
+    ----------
+    say
+        Function that gets a message when the answers stop, and when they begin again.
+    goes_on
+        A text for this message that says what happens in the meantime.
     """
 
     def __init__(self, say: Callable[[str], None], goes_on: str) -> None:
@@ -99,7 +118,7 @@ class Patience:
         self.answered()
 
     def answered(self, news: str = "the service answers again") -> None:
-        """Begin to count anew. news: the message if answers were missing before."""
+        """Begin to count anew. If answers were missing before, the message ``news`` is sent."""
         self._since, self._wait_s = time.monotonic(), FIRST_WAIT_S
         if self._lost:
             self._say(news)

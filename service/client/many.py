@@ -40,10 +40,18 @@ _Step = TypeVar("_Step", bound="_Pending | Outcome")
 
 @dataclass(frozen=True)
 class Outcome:
-    """The outcome for one image. output: the file of its product. existed: the folder contained the product before.
+    """The outcome for one image.
 
-    failure: why there is no product; None if there is one. warnings: what a user of the product must know; empty if the
-    folder contained the product before.
+    Attributes
+    ----------
+    output
+        The file of the product; None if there is none.
+    existed
+        Whether the folder contained the product before.
+    failure
+        Why there is no product; None if there is one.
+    warnings
+        What a user of the product must know; empty if the folder contained the product before.
     """
 
     image: Path
@@ -64,14 +72,32 @@ def deconvolve_many(
 ) -> Iterator[Outcome]:
     """Deconvolve images into a folder, and yield the outcome for each image, in the order of the images.
 
-    At most ``service.jobs_at_once`` jobs are in flight. parameters: as for ``Operations.deconvolve``, except the
-    pictures. If an image cannot be read, deconvolved or written, its outcome has the reason, and the next image
-    follows. overwrite: replace files that have the name of a product but are not this product. progress(done, of) is
-    called at the beginning and after each image.
+    At most ``service.jobs_at_once`` jobs are in flight. If an image cannot be read, deconvolved or written, its outcome
+    has the reason, and the next image follows.
 
-    Raises ``ServiceError`` for an error that concerns every image: "output-not-writable", a refused key, a full
-    quota, or no answer from the service. If the service answers, images whose jobs are in flight are finished before
-    the error is raised. Raises ``WaitInterrupted`` on Control-C; the jobs that this exception names continue.
+    Parameters
+    ----------
+    service
+        The service, or this process, that deconvolves.
+    images
+        The files of the images.
+    folder
+        The folder of the products; it is made if needed.
+    overwrite
+        Whether to replace files that have the name of a product but are not this product.
+    progress
+        Function of the number of images that are done and the number of all images. It is called at the beginning and
+        after each image.
+    **parameters
+        Parameters as for ``Operations.deconvolve``, except the pictures.
+
+    Raises
+    ------
+    ServiceError
+        An error concerns every image: "output-not-writable", a refused key, a full quota, or no answer from the
+        service. If the service answers, images whose jobs are in flight are finished before the error is raised.
+    WaitInterrupted
+        Control-C was pressed. The jobs that this exception names continue.
     """
     check_output_folder(folder)
     Path(folder).mkdir(parents=True, exist_ok=True)
@@ -84,9 +110,14 @@ def deconvolve_many(
 
 @dataclass
 class _Pending:
-    """An image whose outcome is not yet known. key: identity of its product, and SHA-256 of the image.
+    """An image whose outcome is not yet known.
 
-    job: None if an earlier image in flight has the same product.
+    Attributes
+    ----------
+    key
+        Identity of the product, and SHA-256 of the image.
+    job
+        The job that makes the product; None if an earlier image in flight has the same product.
     """
 
     image: Path

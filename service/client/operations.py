@@ -25,8 +25,12 @@ Value = TypeVar("Value")
 class Operations(ABC):
     """The requests to a service, over HTTP or in this process. Every method raises ``ServiceError``.
 
-    server: address of the service; None: this process. jobs_at_once: number of jobs that ``service.client.many`` has in
-    flight.
+    Attributes
+    ----------
+    server
+        Address of the service; None: this process.
+    jobs_at_once
+        Number of jobs that ``service.client.many`` has in flight.
     """
 
     server: str | None = None
@@ -483,7 +487,10 @@ class Operations(ABC):
     ) -> dict[str, Json]:
         """Run a job and download files of its result; returns the description of the result.
 
-        files: the file to write, by the name of the address in the description.
+        Parameters
+        ----------
+        files
+            The file to write for each name of an address in the description; None: this file is not downloaded.
         """
         result = self.run(kind, request, progress)
         for name, path in files.items():

@@ -106,8 +106,18 @@ def admit(request: Request, state: State, scopes: Iterable[str], form_token: str
     """Return the caller of a request, and count the request against the caller's limits. This function waits for the
     database, so call it in a thread.
 
-    form_token: the token that the request contains; default: the token in the header. Raises ``Problem`` 401 without
-    a valid key or session, 403 if a scope or the form token is missing, and 429 if the caller has reached a limit.
+    Parameters
+    ----------
+    scopes
+        The scopes that the key of the caller must have.
+    form_token
+        The form token that the request contains; default: the token in the header.
+
+    Raises
+    ------
+    Problem
+        Status 401 without a valid key or session, 403 if a scope or the form token is missing, and 429 if the caller
+        has reached a limit.
     """
     caller = _let_in(request, state, form_token or request.headers.get(FORM_TOKEN, ""))
     request.state.caller = caller

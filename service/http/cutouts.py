@@ -30,11 +30,20 @@ async def cutout_of(
     *,
     filename: str,
 ) -> Response:
-    """The part of a stored file that ``write(path, target)`` writes, in the turn of the row's owner; or 304 if the
-    client already has it. part: a text that tells the part from the other parts of the file, and from those of other
-    versions.
+    """A part of a stored file, which is made in the turn of the row's owner; or 304 if the client already has this
+    part.
 
-    Raises the errors of ``write`` as a Problem.
+    Parameters
+    ----------
+    row
+        The row with the stored file.
+    part
+        A text that tells the part from the other parts of the file, and from the parts that other versions make.
+    write
+        Function of the path of the stored file and of an open file, into which it writes the part. Its errors are
+        raised as a ``Problem``.
+    filename
+        The name of the part for the client.
     """
     headers = files.headers_of(f"{row.file_sha256} {part}")
     if (same := files.not_modified(request, headers)) is not None:

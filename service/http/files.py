@@ -57,10 +57,23 @@ def send(
     size: int | None = None,
     missing: tuple[str, str] | None = None,
 ) -> Response:
-    """The file with this SHA-256 as ETag, or 304 if the client already has it. size: as for ``path_of``.
+    """The file with this SHA-256 as ETag, or 304 if the client already has it.
 
-    Clients can check the received file against the SHA-256 in the header Repr-Digest (RFC 9530). Raises ``Problem`` 410
-    if the file is lost, and 404 with the code and the message of ``missing`` if digest is None.
+    Clients can check the received file against the SHA-256 in the header Repr-Digest (RFC 9530).
+
+    Parameters
+    ----------
+    digest
+        SHA-256 of the file; None: there is no file.
+    size
+        Recorded size of the file, bytes, as for ``path_of``.
+    missing
+        Code and message of the error if ``digest`` is None.
+
+    Raises
+    ------
+    Problem
+        Status 410 if the file is lost, and 404 if ``digest`` is None.
     """
     if digest is None:
         assert missing is not None
@@ -95,7 +108,7 @@ class _Stored(FileResponse):
 
 
 def headers_of(content: str) -> dict[str, str]:
-    """The headers of an answer that is made from stored files. content: a text that determines the answer."""
+    """The headers of an answer that is made from stored files. The text ``content`` determines the answer."""
     return {"ETag": f'"{hashlib.sha256(content.encode()).hexdigest()}"', "Cache-Control": KEPT}
 
 
@@ -174,9 +187,15 @@ OPENAPI_TRANSIT_BODY = _body("archive of the transit (.zip, .tar or .tar.gz)", "
 class UploadKind(Generic[Row]):
     """A kind of file that can be uploaded.
 
-    may_start: whether a file of this kind can start with these bytes; True as second argument: there are no further
-    bytes. content: reads the summary of a file, and raises DataError if the file cannot be used. row: makes the row of
-    a file from its owner, SHA-256, size, name and summary.
+    Attributes
+    ----------
+    may_start
+        Function that says whether a file of this kind can start with these bytes. Its second argument is True if the
+        file has no further bytes.
+    content
+        Function that reads the summary of a file, and raises DataError if the file cannot be used.
+    row
+        Function that makes the row of a file from its owner, SHA-256, size, name and summary.
     """
 
     address: str
@@ -217,7 +236,12 @@ class UploadKind(Generic[Row]):
 class RequestFile:
     """A file of a request, which is written to a temporary path and hashed while it arrives.
 
-    filename: the name that the client gives to the file. bytes: the number of bytes that have arrived.
+    Attributes
+    ----------
+    filename
+        The name that the client gives to the file.
+    bytes
+        The number of bytes that have arrived.
     """
 
     def __init__(self, path: Path) -> None:
@@ -291,10 +315,20 @@ async def add_upload(
 ) -> Row:
     """Receive the file of a request, check it and add it to the catalogue; returns its row.
 
-    Sets the status and the header Location of the response. equal: finds a row that stands for the file with this
-    SHA-256; the file is then not added. columns: further arguments of ``kind.row``. Raises ``Problem`` 413 if the file
-    exceeds the size limit or the quota, 415 if it is of another kind, 400 for a broken form or an incomplete upload,
-    and 422 if the content shows that the file cannot be used.
+    Sets the status and the header Location of the response.
+
+    Parameters
+    ----------
+    equal
+        Function that finds a row that stands for the file with this SHA-256. If there is one, the file is not added.
+    columns
+        Further arguments of ``kind.row``.
+
+    Raises
+    ------
+    Problem
+        Status 413 if the file exceeds the size limit or the quota, 415 if it is of another kind, 400 for a broken form
+        or an incomplete upload, and 422 if the content shows that the file cannot be used.
     """
     allowed = Allowed(state, caller)
     with state.store.temporary() as path, _advising(request):

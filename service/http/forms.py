@@ -17,7 +17,13 @@ FORM, URL_ENCODED = "multipart/form-data", "application/x-www-form-urlencoded"
 
 @dataclass(frozen=True, eq=False)
 class FormPart:
-    """A part of a form. filename: the name that the client gives to a file; None if the part is a field."""
+    """A part of a form.
+
+    Attributes
+    ----------
+    filename
+        The name that the client gives to a file; None if the part is a field.
+    """
 
     name: str
     filename: str | None
@@ -80,7 +86,13 @@ def _bad(message: str) -> Problem:
 
 
 class _Parts:
-    """The parts of a form. whole: whether the end of the form has arrived."""
+    """The parts of a form.
+
+    Attributes
+    ----------
+    whole
+        Whether the end of the form has arrived.
+    """
 
     def __init__(self, boundary: bytes) -> None:
         self.whole = False

@@ -28,8 +28,12 @@ Endpoint = TypeVar("Endpoint", bound=Callable[..., object])
 
 @dataclass
 class _Queue:
-    """The requests of an owner. taken_s: the time that its work has taken, without the time of the places that it
-    holds.
+    """The requests of an owner.
+
+    Attributes
+    ----------
+    taken_s
+        The time that the owner's work has taken, s, without the time of the places that the owner holds now.
     """
 
     taken_s: float
@@ -41,10 +45,10 @@ class _Queue:
 
 
 class Gate:
-    """Gives places to the work of owners in turn. now: a clock, s."""
+    """Gives places to the work of owners in turn. The function ``now`` is a clock, s."""
 
     def __init__(self, places: int, now: Callable[[], float] = time.monotonic) -> None:
-        """places: the number of works that run at the same time, at least 2."""
+        """Let ``places`` works run at the same time, at least 2."""
         self._free, self._now = places, now
         self._queues: dict[str, _Queue] = {}
         self._threads = anyio.CapacityLimiter(places)

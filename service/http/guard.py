@@ -58,7 +58,7 @@ NO_TEXT = re.compile("[\0\ud800-\udfff]")
 
 
 def install(app: FastAPI, access: Access, settings: Settings, as_page: AsPage) -> None:
-    """Guard every request of the application. as_page: makes the page of a refusal, for browsers."""
+    """Guard every request of the application. ``as_page`` makes the page of a refusal, for browsers."""
     app.add_middleware(_Guard, access=access, settings=settings, as_page=as_page)
 
 

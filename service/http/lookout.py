@@ -38,7 +38,15 @@ Key = tuple[str, str]  # kind and id of a job or bulk run
 
 @dataclass(frozen=True)
 class StreamKind(Generic[Row]):
-    """What events tell of: jobs or bulk runs. name: of the events. view: the description of a row."""
+    """What events report: jobs or bulk runs.
+
+    Attributes
+    ----------
+    name
+        The name of the events.
+    view
+        Function that makes the description of a row.
+    """
 
     name: str
     changes: Changes[Row]
@@ -47,7 +55,13 @@ class StreamKind(Generic[Row]):
 
 @dataclass(frozen=True)
 class State:
-    """A job or bulk run as it is now. data: its description, JSON."""
+    """A job or bulk run as it is now.
+
+    Attributes
+    ----------
+    data
+        The description of the job or bulk run, as JSON.
+    """
 
     version: str
     ended: bool
@@ -61,9 +75,18 @@ def version(changed_at: float) -> str:
 
 @dataclass(frozen=True)
 class Sight:
-    """What a look has seen. after: for each kind, the row after which the next look goes on. changed: what the streams
-    of the whole owner tell. versions: of these and of all that a follower knows, if they exist. states: of those that a
-    follower does not know.
+    """The result of a look.
+
+    Attributes
+    ----------
+    after
+        For each kind, the row after which the next look continues.
+    changed
+        The jobs and bulk runs whose changes the streams of the whole owner report.
+    versions
+        The versions of the jobs and bulk runs that changed or that a follower knows, if they exist.
+    states
+        The states of the jobs and bulk runs whose present version a follower does not know.
     """
 
     after: Sequence[Moment]
@@ -76,10 +99,23 @@ class Follower:
     """A stream of the events of one job or bulk run, until it reaches its final state or is deleted, as the lookout of
     its owner sees it.
 
-    caller: whose key must stay valid. known: the versions that the client knows; "": none yet; None: the deletion.
-    whole: whether the stream follows all jobs and bulk runs of the owner, or only those in ``known``. after: as in
-    ``Sight``; None: the last seconds. begun: whether it has looked. joined: whether its own looks have ended, so that
-    the lookout looks for it too. said: the texts that the client has not got yet.
+    Attributes
+    ----------
+    caller
+        The caller whose key must stay valid.
+    known
+        The versions that the client knows; "": it knows none yet; None: it knows that the job or bulk run was deleted.
+    whole
+        Whether the stream follows all jobs and bulk runs of the owner, or only those in ``known``.
+    after
+        For each kind, the row after which the next look continues, as in ``Sight``; None: the next look reads the
+        changes of the last seconds.
+    begun
+        Whether the follower has looked at the database.
+    joined
+        Whether the follower's own looks have ended, so that the lookout looks for it too.
+    said
+        The texts that the client has not got yet.
     """
 
     whole = False
@@ -122,7 +158,13 @@ class Follower:
 
 
 class OwnerFollower(Follower):
-    """A stream of the events of all jobs and bulk runs of an owner. named: those that the request names."""
+    """A stream of the events of all jobs and bulk runs of an owner.
+
+    Attributes
+    ----------
+    named
+        The jobs and bulk runs that the request names.
+    """
 
     whole = True
 
@@ -172,7 +214,15 @@ class Lookout:
         clock: Callable[[], float],
         let_in: Callable[[Hashable], bool],
     ) -> None:
-        """clock: the time of the database. let_in: whether the key of a caller is still valid."""
+        """Begin without followers.
+
+        Parameters
+        ----------
+        clock
+            Function that returns the time of the database, s since 1970.
+        let_in
+            Function that says whether the key of a caller is still valid.
+        """
         self._owner, self._kinds, self._clock, self._let_in = owner, kinds, clock, let_in
         self._followers: list[Follower] = []
         self._after: Sequence[Moment] | None = None

@@ -100,7 +100,12 @@ class Listing:
     ) -> str | None:
         """The address of the next page; None if the rows that ``query`` gave are the last.
 
-        place_of: the parts of the cursor that names a row.
+        Parameters
+        ----------
+        rows
+            The rows that ``query`` gave.
+        place_of
+            Function that returns the parts of the cursor that names a row.
         """
         if len(rows) <= self.limit:
             return None
@@ -114,7 +119,17 @@ class Listing:
         view: Callable[[Row], Item],
         place_of: Callable[[Row], tuple[str, ...]] = _place_in_time,
     ) -> Page[Item]:
-        """The page of the rows that ``query`` gave. place_of: as for ``following``."""
+        """The page of the rows that ``query`` gave.
+
+        Parameters
+        ----------
+        rows
+            The rows that ``query`` gave.
+        view
+            Function that makes the item of a row.
+        place_of
+            Function that returns the parts of the cursor that names a row, as for ``following``.
+        """
         return Page(items=[view(row) for row in rows[: self.limit]], next=self.following(rows, place_of))
 
 

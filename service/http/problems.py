@@ -118,7 +118,7 @@ class Problem(HTTPException):
 
 
 def problem(error: DataError, **more: object) -> Problem:
-    """The HTTP error for a DataError, with the same code, message and fields. more: fields to add."""
+    """The HTTP error for a DataError, with the same code, message and fields, and the further fields in ``more``."""
     return Problem(
         STATUS_OF.get(error.code, 422), error.code, error.message, headers=None, **{**error.fields, **more}
     )
@@ -154,7 +154,10 @@ AsPage = Callable[[Request, int, str, str, Mapping[str, object]], Response]
 def answer(request: Request, error: Problem, as_page: AsPage) -> Response:
     """The answer to a request that failed: a problem document, or a page if a browser asked for a page.
 
-    as_page: a function (request, status, code, detail, fields) that makes the page.
+    Parameters
+    ----------
+    as_page
+        Function (request, status, code, detail, fields) that makes the page.
     """
     if wants_page(request):
         page = as_page(request, error.status, error.code, error.detail, error.more)

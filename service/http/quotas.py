@@ -23,7 +23,11 @@ from workers.files.store import STORAGE_FULL
 class Allowed:
     """Counts the bytes of one upload against the caller's rate and against the owner's quota.
 
-    upload_id: the id of the resumable upload that the bytes belong to; its declared length does not count as used.
+    Parameters
+    ----------
+    upload_id
+        The id of the resumable upload that the bytes belong to; its declared length does not count as used. None: the
+        upload is not resumable.
     """
 
     def __init__(self, state: State, caller: Caller, upload_id: str | None = None) -> None:

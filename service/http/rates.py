@@ -126,7 +126,17 @@ class AtOnce:
     """Counts the requests or streams that each caller has open in this process, and limits their number."""
 
     def __init__(self, most: int, code: str, what: str) -> None:
-        """most: the limit for each caller. code: the error code. what: a plural for the message, such as "requests"."""
+        """Limit the requests or streams that each caller has open at the same time.
+
+        Parameters
+        ----------
+        most
+            The limit for each caller.
+        code
+            The code of the error if a caller exceeds the limit.
+        what
+            A plural for the message of this error, such as "requests".
+        """
         self._most, self._code, self._what = most, code, what
         self._open: Counter[str] = Counter()
         self._lock = threading.Lock()

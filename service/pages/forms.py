@@ -87,10 +87,18 @@ def number_field(kind: str, name: str) -> Markup:
 
 
 def checked(model: Callable[..., Checked], values: Mapping[str, object], *, above: int = 0) -> Checked:
-    """The model with these values; or what a function returns for them.
+    """The model with these values, or what a function returns for them.
 
-    above: how many names to remove from the start of each field's path (``loc``), because they are levels of the model
-    and not fields of the form. Raises ``Problem`` 422, which names each wrong field.
+    Parameters
+    ----------
+    above
+        How many names to remove from the start of each field's path (``loc``), because they are levels of the model and
+        not fields of the form.
+
+    Raises
+    ------
+    Problem
+        Status 422; the error names each wrong field.
     """
     try:
         return cast("Checked", _adapter(model).validate_python(dict(values)))
@@ -149,7 +157,9 @@ def image_address(image_id: str, form: Sent) -> str:
 
 
 def address_of(resolved: Mapping[str, Any]) -> str:
-    """The page of an image, with the options of a deconvolution. resolved: the resolved parameters of its job."""
+    """The page of an image, with the options of a deconvolution. ``resolved`` contains the resolved parameters of its
+    job.
+    """
     method, figures = resolved["method"], resolved.get("noise") or {}
     chosen = resolved.get("picked_for") is None and resolved.get("psf_recipe") is None
     options = {

@@ -339,8 +339,12 @@ def _lost(state: State, digest: str, size: int) -> str | None:
 
 
 def _again(row: ProductRow, *, psf_id: str | None = None) -> str:
-    """The page of the image, with the options of the product. psf_id: another PSF; empty: the one that the service
-    chooses.
+    """The page of the image, with the options of the product.
+
+    Parameters
+    ----------
+    psf_id
+        The id of another PSF; empty: the PSF that the service chooses; None: the PSF of the product.
     """
     other = {} if psf_id is None else {"psf_id": psf_id, "picked_for": None, "psf_recipe": None}
     return address_of({**row.details["parameters"], **other})

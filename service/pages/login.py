@@ -106,9 +106,15 @@ def login_page(
     ended: bool = False,
     arrived: bool = False,
 ) -> Response:
-    """The form for the key. ended: a script found that the session has ended.
+    """The form for the key.
 
-    arrived: the person followed a link on another site. If the session is open, the requested page is opened at once.
+    Parameters
+    ----------
+    ended
+        Whether a script found that the session has ended.
+    arrived
+        Whether the person followed a link on another site. If the session is open, the requested page is then opened at
+        once.
     """
     valid, note = _session(request, state)
     if valid and arrived:

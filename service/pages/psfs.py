@@ -87,8 +87,8 @@ async def upload(
     kind: KindOfUpload = None,
     image: Annotated[Identity | None, Query()] = None,
 ) -> Response:
-    """Take a PSF from the form, and go to its page, or to the page of the image for which it was sent. kind: as for the
-    API.
+    """Take a PSF from the form, and go to its page, or to the page of the image for which it was sent. The API explains
+    ``kind``.
     """
     view = await upload_psf(request, response, caller, state, kind=kind)
     return RedirectResponse(f"/psfs/{view.id}" if image is None else f"/images/{image}?psf_id={view.id}", 303)

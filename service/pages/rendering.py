@@ -67,7 +67,7 @@ def page(
     headers: Mapping[str, str] | None = None,
     **shown: object,
 ) -> HTMLResponse:
-    """A page. template: its name. shown: the variables of the template."""
+    """A page: the template of this name with the variables in ``shown``."""
     caller: Caller | None = getattr(request.state, "caller", None)
     token: str = getattr(request.state, "form_token", "")
     field = Markup('<input type="hidden" name="form_token" value="{}">').format(token) if token else ""
@@ -151,7 +151,7 @@ def short(identity: str) -> str:
 
 
 def date(seconds: float | None) -> Markup | str:
-    """Date and time in UTC, as a `<time>` element; "-" for None. seconds: seconds since 1970."""
+    """Date and time in UTC, as a `<time>` element, from seconds since 1970; "-" for None."""
     if seconds is None:
         return "-"
     moment = datetime.fromtimestamp(seconds, UTC)

@@ -38,7 +38,9 @@ def of_problem(problem: Problem) -> str:
 
 
 def of_error(code: str, message: str, fields: Mapping[str, object] = _NO_FIELDS) -> str:
-    """The sentence for an error. fields: the fields of its ``DataError``; empty for the stored error of a job."""
+    """The sentence for an error. ``fields`` are the fields of its ``DataError``, and empty for the stored error of a
+    job.
+    """
     thing = NAMES.get(code.removeprefix("no-such-"))
     if thing is not None and message.startswith("expected the id"):
         return (

@@ -31,8 +31,12 @@ router = APIRouter(prefix="/vo", tags=["VO"])
 
 @dataclass(frozen=True)
 class Offered:
-    """An interface of the service. use: "full" for a complete address, "base" for one to which a client adds parameters
-    or names.
+    """An interface of the service.
+
+    Attributes
+    ----------
+    use
+        "full" for a complete address, "base" for an address to which a client adds parameters or names.
     """
 
     standard_id: str

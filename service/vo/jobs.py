@@ -60,7 +60,9 @@ TO_JOB: RouteOptions = {"status_code": 303, "response_class": RedirectResponse}
 
 
 def _form(**described: str) -> RouteOptions:
-    """A route that reads a form and answers with the address of a job. described: the descriptions of the fields."""
+    """A route that reads a form and answers with the address of a job. Its fields have the descriptions in
+    ``described``.
+    """
     fields = {name: {"type": "string", "description": text} for name, text in described.items()}
     schema = {"type": "object", "properties": fields, "additionalProperties": {"type": "string"}}
     return {**TO_JOB, "openapi_extra": {"requestBody": {"content": {URL_ENCODED: {"schema": schema}}}}}

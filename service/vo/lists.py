@@ -131,8 +131,14 @@ def row_named(state: State, caller: Caller, name: str) -> ProductRow | PsfRow | 
 
 
 def product_record(row: ProductRow, image: ImageRow | None, base: str) -> dict[str, object]:
-    """The values of a product's columns. image: the input; None if the service does not keep it (bulk runs over an
-    archive).
+    """The values of a product's columns.
+
+    Parameters
+    ----------
+    image
+        The image that was deconvolved; None if the service does not keep it (bulk runs over an archive).
+    base
+        The address of the service.
     """
     seen: Mapping[str, Any] = {} if image is None else image.summary
     shape, cards = seen.get("shape", (None, None)), seen.get("cards", {})

@@ -278,9 +278,14 @@ LINKS = (
 
 @dataclass(frozen=True)
 class Input:
-    """A parameter of a described service. value: the value that the request must have; empty: the client chooses it.
+    """A parameter of a described service.
 
-    ref: the ID of the column that contains the value.
+    Attributes
+    ----------
+    value
+        The value that the request must have; empty: the client chooses the value.
+    ref
+        The ID of the column that contains the value.
     """
 
     name: str
@@ -313,9 +318,18 @@ def table_document(
     infos: Mapping[str, str] | None = None,
     services: Iterable[Service] = (),
 ) -> bytes:
-    """A VOTable with one table. rows: the values by the name of the column; a value that is missing or None is null.
+    """A VOTable with one table.
 
-    status: QUERY_STATUS, "OK" or "OVERFLOW". infos: further INFO elements.
+    Parameters
+    ----------
+    rows
+        The values of each row by the name of the column; a value that is missing or None is null.
+    status
+        QUERY_STATUS, "OK" or "OVERFLOW".
+    infos
+        The values of further INFO elements, by name.
+    services
+        The services that the document describes.
     """
     from astropy.io.votable import tree
 

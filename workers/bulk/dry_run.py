@@ -225,7 +225,7 @@ class _DryRun:
 
 
 def product_bytes(shape: Sequence[int], error_draws: int) -> int:
-    """The expected size of a product's file, bytes. shape: (ny, nx) of the image, px."""
+    """The expected size of a product's file, bytes, for an image of the shape (ny, nx), px."""
     pixels = shape[0] * shape[1]
     planes = [IMAGE_BYTES, QUALITY_BYTES] + ([ERROR_BYTES] if error_draws else [])
     return sum(HEADER_BYTES + -(-pixels * size // BLOCK_BYTES) * BLOCK_BYTES for size in planes)

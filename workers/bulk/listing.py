@@ -36,8 +36,14 @@ ADD_EVERY_S = (
 
 @dataclass(frozen=True)
 class SearchPosition:
-    """How far the search for the files of a run has come. pattern: number of the pattern. names: see
-    ``archive.Entry``.
+    """How far the search for the files of a run has come.
+
+    Attributes
+    ----------
+    pattern
+        Number of the pattern.
+    names
+        The position within the search for this pattern; see ``archive.Entry``.
     """
 
     pattern: int
@@ -62,9 +68,16 @@ def list_files(
     """Add the files that the patterns of a bulk run match to its images, from the position where an earlier search
     ended.
 
-    bulk: the row that ``Bulks.begin_listing`` returned for the lease of the workspace. added: called after images were
-    added. stops: whether the search must end now; another turn then continues it. An error that concerns all files
-    stops the run. Images that were added before it stay.
+    An error that concerns all files stops the run. Images that were added before the error stay.
+
+    Parameters
+    ----------
+    bulk
+        The row that ``Bulks.begin_listing`` returned for the lease of the workspace.
+    added
+        Function that is called after images were added.
+    stops
+        Function that says whether the search must end now; another turn then continues it.
     """
     bulks = workspace.catalogue.bulks
     assert workspace.lease is not None
@@ -138,9 +151,21 @@ def found_files(
     """Search the files that match the patterns of a request; each file is found once even if several patterns match it.
 
     Each step of the search looks at one folder or entry: its position comes with the image that was found there, or
-    None. A file that cannot be used comes with its error. after: continue a search that ended after this position.
-    known: paths that it found, if there are several patterns. listed: number of images that are listed. Raises
-    DataError "bad-path", "path-not-allowed", "unreadable-folder", "too-many-images".
+    None. A file that cannot be used comes with its error.
+
+    Parameters
+    ----------
+    after
+        The position after which an earlier search ended, and this one continues; None: from the beginning.
+    known
+        Paths that the earlier search found, if there are several patterns.
+    listed
+        Number of images that are already listed.
+
+    Raises
+    ------
+    DataError
+        "bad-path", "path-not-allowed", "unreadable-folder", "too-many-images".
     """
     allowed = archive_files.roots(settings.bulk_roots)
     seen = set(known)

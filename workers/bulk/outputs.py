@@ -22,9 +22,20 @@ from workers.versions import seconds
 
 @dataclass(frozen=True)
 class Source:
-    """An image of a bulk run: its SHA-256, the summary of its header, and its file name.
+    """An image of a bulk run.
 
-    path: the path of a file of the archive; None for an upload. copy: a copy of this file, if it was made.
+    Attributes
+    ----------
+    sha256
+        SHA-256 of the file.
+    summary
+        Summary of the header.
+    name
+        File name of the image.
+    path
+        Path of a file of the archive; None for an upload.
+    copy
+        A copy of the file of the archive, if it was made.
     """
 
     sha256: str
@@ -35,9 +46,17 @@ class Source:
 
 
 def target_of(output: Output, settings: Settings, source: Source, *, identity: str, psf_id: str) -> Path:
-    """The path of a product. identity: id of the product.
+    """The path of a product.
 
-    Raises DataError "path-not-allowed", "bad-path", and "no-output-name" if the layout cannot name this image.
+    Parameters
+    ----------
+    identity
+        The id of the product.
+
+    Raises
+    ------
+    DataError
+        "path-not-allowed", "bad-path", and "no-output-name" if the layout cannot name this image.
     """
     folder = archive_files.check_under(Path(output.folder), _roots(settings), "an output folder")
     if output.layout is None:

@@ -59,7 +59,15 @@ def bulk_turn(workspace: CatalogueWorkspace, parameters: Mapping[str, object]) -
 
 @dataclass(frozen=True)
 class _Reading:
-    """An image that a thread takes and then reads. image: the image itself, and the time that reading took, s."""
+    """An image that a thread takes and then reads.
+
+    Attributes
+    ----------
+    item
+        The row of the image in the run; None if there was no image to take.
+    image
+        The image itself, and the time that reading took, s; None if there was no image to take.
+    """
 
     item: Future[BulkItemRow | None]
     image: Future[tuple[Ready | Outcome, float] | None]
@@ -247,7 +255,7 @@ class _Turn:
         return dataclasses.replace(outcome, statistics=outcome.statistics | kernel)
 
     def _record(self, item: BulkItemRow, write: Callable[[], Outcome], before_s: float) -> None:
-        """Write a product, and record the result of its image. before_s: time that the worker already spent on the
+        """Write a product, and record the result of its image. The worker already spent ``before_s`` seconds on the
         image.
         """
         began = time.perf_counter()

@@ -84,11 +84,24 @@ class Keys(Queries):
         made_by: str | None = None,
         most: int | None = None,
     ) -> str:
-        """Make a key and return it; it cannot be shown again. Raises ValueError for a bad owner or without scopes.
+        """Make a key and return it; it cannot be shown again.
 
-        made_by: id of the key with which the new key is made. most: the largest number of valid keys of the owner;
-        None: no limit. Raises ``TooManyKeys`` if the owner already has ``most`` valid keys. Otherwise only the newest
-        ``most`` of the owner's revoked and expired keys are kept; the older ones are deleted.
+        If ``most`` is given, only the newest ``most`` of the owner's revoked and expired keys are kept; the older ones
+        are deleted.
+
+        Parameters
+        ----------
+        made_by
+            The id of the key with which the new key is made.
+        most
+            The largest number of valid keys of the owner; None: no limit.
+
+        Raises
+        ------
+        ValueError
+            The owner has a bad name, or there are no scopes.
+        TooManyKeys
+            The owner already has ``most`` valid keys. No key is then deleted.
         """
         if not OWNER.fullmatch(owner):
             raise ValueError(f"expected an owner of {OWNER_RULE}; got {owner!r}")
@@ -155,9 +168,14 @@ class Keys(Queries):
     def page(
         self, owner: str | None, *, limit: int, after: tuple[float, str] | None = None
     ) -> Sequence[KeyRow]:
-        """One page of a list of keys, newest first. owner: None for the keys of all owners.
+        """One page of a list of keys, newest first.
 
-        after: (created_at, id) of the last key of the page before; None for the first page.
+        Parameters
+        ----------
+        owner
+            The owner of the keys; None: the keys of all owners.
+        after
+            (created_at, id) of the last key of the page before; None for the first page.
         """
         query = select(KeyRow)
         if owner is not None:
@@ -171,7 +189,10 @@ class Keys(Queries):
     def revoke(self, identity: str, *, and_made: bool = False) -> bool:
         """Revoke a key. The next request with it is refused. Returns False if there is no key with this id.
 
-        and_made: also revoke all keys that were made with this key, directly or with one of the keys made with it.
+        Parameters
+        ----------
+        and_made
+            Whether to revoke also all keys that were made with this key, directly or with one of the keys made with it.
         """
         revoked_at = func.coalesce(KeyRow.revoked_at, time.time())
         with self._database.writing.begin() as session:

@@ -53,10 +53,15 @@ class AffectedProducts(Queries):
     def page(
         self, owner: str, *, superseded: bool, limit: int, after: PageEnd | None = None
     ) -> list[AffectedProduct]:
-        """Products that were made with deprecated PSFs. superseded: only PSFs that have a successor.
+        """Products that were made with deprecated PSFs.
 
         The method makes several queries, each of which reads only the rows that it returns. A single query with a join
         would be slower: it would sort all products of a PSF first.
+
+        Parameters
+        ----------
+        superseded
+            Whether to leave out the products of PSFs that have no successor.
         """
         affected: list[AffectedProduct] = []
         with self._database.reading() as session:

@@ -20,7 +20,15 @@ PACE_S, PACE_IMAGES = 3600.0, 500
 
 @dataclass(frozen=True)
 class Pace:
-    """The speed of a bulk run. taken: number of images that workers process now. images_an_hour: None if not known."""
+    """The speed of a bulk run.
+
+    Attributes
+    ----------
+    taken
+        Number of images that workers process now.
+    images_an_hour
+        Number of images that ended per hour; None if not known.
+    """
 
     taken: int
     images_an_hour: float | None
@@ -28,8 +36,14 @@ class Pace:
 
 @dataclass(frozen=True)
 class Reason:
-    """The failed images of a run with the same error code. images: their number. example: the first of them in the
-    run.
+    """The failed images of a run with the same error code.
+
+    Attributes
+    ----------
+    images
+        Number of these images.
+    example
+        The first of these images in the run.
     """
 
     code: str

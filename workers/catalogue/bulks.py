@@ -207,7 +207,10 @@ class Bulks(Queries):
     ) -> bool:
         """Add images to a run. Returns False if another lease now lists the files, or if the run is not LISTING.
 
-        listed_to: the place up to which the files are then listed.
+        Parameters
+        ----------
+        listed_to
+            The place up to which the files are listed once these images are added.
         """
         with self._database.writing.begin() as session:
             bulk = _listed_by(session, bulk_id, lease)

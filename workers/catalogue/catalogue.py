@@ -124,9 +124,17 @@ class Catalogue:
     def add(self, row: Row, quota_mib: int | None = None) -> tuple[Row, bool]:
         """Insert a content-addressed row; returns the row with this identity, and whether it is new.
 
-        quota_mib: the limit for owners who have no individual limit; None: no limit applies. If the file does not fit,
-        the owner's oldest kept solutions are removed until it fits. If it would not fit even without any kept solution,
-        nothing is added or removed, and ``workers.catalogue.quotas.OverQuota`` is raised.
+        If the file does not fit, the owner's oldest kept solutions are removed until it fits.
+
+        Parameters
+        ----------
+        quota_mib
+            The limit for owners who have no individual limit, MiB; None: no limit applies.
+
+        Raises
+        ------
+        workers.catalogue.quotas.OverQuota
+            The file would not fit even without any kept solution. Nothing is added or removed.
         """
         attempts = 0
         while True:
@@ -220,9 +228,14 @@ class Catalogue:
         after: tuple[float, str] | None = None,
         **equal: str | None,
     ) -> Sequence[AnyRow]:
-        """A page of rows, newest first. after: (created_at, id) of the last row of the previous page.
+        """A page of rows, newest first.
 
-        equal: values of columns; only rows with these values are returned.
+        Parameters
+        ----------
+        after
+            (created_at, id) of the last row of the previous page; None for the first page.
+        **equal
+            Values of columns; only rows with these values are returned. A column whose value is None does not count.
         """
         query: Select[AnyRow] = select(table).where(table.owner == owner)
         for column, value in equal.items():

@@ -38,8 +38,16 @@ class Changes(Generic[Row]):
         *order: InstrumentedAttribute[str],
         only: ColumnElement[bool] | None = None,
     ) -> None:
-        """phases: of rows that have not ended. order: of these rows, before the newest first. only: a condition on the
-        rows that ``open`` and ``since`` find; None: all.
+        """Find the changes of the rows of ``table``.
+
+        Parameters
+        ----------
+        phases
+            The phases of rows that have not ended.
+        *order
+            The columns by which rows that have not ended are sorted first; rows that are equal there come newest first.
+        only
+            A condition on the rows that ``open`` and ``since`` find; None: all rows.
         """
         self._database, self._order = database, order
         self._table: type[Row] = table

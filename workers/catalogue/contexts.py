@@ -44,8 +44,12 @@ _SHORT_ID = re.compile(SHORT_ID)
 class Ends:
     """The two PSFs between which a time lies.
 
-    before_time: the end of the range of the earlier PSF. after_time: the start of the range of the later PSF. Both in
-    seconds since 1970.
+    Attributes
+    ----------
+    before_time
+        The end of the range of the earlier PSF, in seconds since 1970.
+    after_time
+        The start of the range of the later PSF, in seconds since 1970.
     """
 
     before_psf_id: str
@@ -120,8 +124,19 @@ class Series(Queries):
     def ends(self, series: str, at: float, owner: str, context_id: str | None) -> Ends | None:
         """The PSFs between which a time lies, if the series may be interpolated.
 
-        context_id: search the pins of this context instead of the certified PSFs. None: the series may not be
-        interpolated, or the time is not between two ranges. Call this only for a time for which no PSF is valid.
+        Call this only for a time for which no PSF is valid.
+
+        Parameters
+        ----------
+        at
+            The time, in seconds since 1970.
+        context_id
+            The context whose pins are searched; None: the certified PSFs are searched.
+
+        Returns
+        -------
+        Ends or None
+            The two PSFs. None: the series may not be interpolated, or the time is not between two ranges.
         """
         with self._database.reading() as session:
             if context_id is None:

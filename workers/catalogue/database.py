@@ -71,7 +71,10 @@ def _now_of_sqlite(*_: object, **__: object) -> str:
 class Database:
     """An engine and its sessions. ``writing`` takes SQLite's write lock at the start; ``reading`` takes no lock.
 
-    now: the time of the database's clock, as an SQL expression.
+    Attributes
+    ----------
+    now
+        The time of the database's clock, as an SQL expression.
     """
 
     now = Now()
@@ -179,8 +182,12 @@ def newest_first(
 ) -> Select[*Columns]:
     """A page of a query for rows of a table, newest first.
 
-    dates: the columns created_at and id of the table.
-    after: (created_at, id) of the last row of the previous page; None for the first page.
+    Parameters
+    ----------
+    dates
+        The columns created_at and id of the table.
+    after
+        (created_at, id) of the last row of the previous page; None for the first page.
     """
     if after is not None:
         query = query.where(tuple_(*dates) < after)

@@ -49,13 +49,21 @@ class Jobs(Queries):
         queue: Queue | None = None,
         estimate: dict[str, float] | None = None,
     ) -> tuple[JobRow, bool]:
-        """Queue a new job, or share the job of an identical request that is queued, executing or completed. Returns
-        the job, and whether it is new.
+        """Queue a new job, or share the job of an identical request that is queued, executing or completed.
 
-        queue: the queue of the new job; None: the default queue of the job's kind. A shared job that waits in a less
-        urgent queue moves to ``queue``. A cancelled job or a job with UWS terms is not shared: the new job then gets
-        a different key. The new job waits while the other job executes. If the other job has a result, the new job
-        then uses this result.
+        A shared job that waits in a less urgent queue moves to ``queue``. A cancelled job or a job with UWS terms is
+        not shared: the new job then gets a different key. The new job waits while the other job executes. If the other
+        job has a result, the new job then uses this result.
+
+        Parameters
+        ----------
+        queue
+            The queue of the new job; None: the default queue of the job's kind.
+
+        Returns
+        -------
+        tuple[JobRow, bool]
+            The job, and whether it is new.
         """
         queue = queue or queue_of(kind)
         for _ in range(3):  # between the two statements, the identical job may fail
@@ -291,9 +299,17 @@ class Jobs(Queries):
         oldest first.
 
         A job seems lost when it has waited for ``resubmit_s`` since its submission. This waiting time doubles with each
-        submission, so that the jobs of a long queue are not submitted again and again. idle: there are workers, and
-        they do nothing; then the waiting time does not double, because a message that the broker still had would be
-        taken.
+        submission, so that the jobs of a long queue are not submitted again and again.
+
+        Parameters
+        ----------
+        resubmit_s
+            The first waiting time, s.
+        limit
+            The largest number of jobs that are returned.
+        idle
+            Whether there are workers, and all of them do nothing. The waiting time then does not double, because a
+            worker would have taken a message that the broker still had.
         """
         waits = {number: resubmit_s * 2.0 ** max(0, number - 1) for number in range(9)}
         growing_s = case(waits, value=JobRow.submissions, else_=resubmit_s * 2.0**8)
@@ -345,7 +361,10 @@ class Jobs(Queries):
         """Whether this worker runs a job of these queues, or one waits and could start now, or has lost its worker:
         that job will wait soon.
 
-        lease_s: time without a heartbeat after which a worker counts as lost, s.
+        Parameters
+        ----------
+        lease_s
+            Time without a heartbeat after which a worker counts as lost, s.
         """
         silent = JobRow.heartbeat_at < self._database.now - lease_s
         waits = (

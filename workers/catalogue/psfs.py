@@ -66,7 +66,13 @@ class Psfs(Queries):
     def page(
         self, filters: PsfFilter, owner: str, *, limit: int, after: tuple[float, str] | None = None
     ) -> Sequence[PsfRow]:
-        """A page of PSFs, newest first. after: (created_at, id) of the last row of the previous page."""
+        """A page of PSFs, newest first.
+
+        Parameters
+        ----------
+        after
+            (created_at, id) of the last row of the previous page; None for the first page.
+        """
         return self._database.all(
             newest_first(_query(filters, owner), (PsfRow.created_at, PsfRow.id), limit, after)
         )
@@ -203,7 +209,9 @@ def _released(series: str, owner: str) -> Select[str]:
 
 
 def existing_psf(session: Session, psf_id: str, owner: str, *, lock: bool = False) -> PsfRow:
-    """The row of a PSF; lock: until the transaction ends. Raises ``DataError`` "no-such-psf"."""
+    """The row of a PSF. With ``lock``, the row is locked until the transaction ends. Raises ``DataError``
+    "no-such-psf".
+    """
     row = session.get(PsfRow, (owner, psf_id), populate_existing=lock, with_for_update=lock or None)
     if row is None:
         raise DataError(

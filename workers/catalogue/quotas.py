@@ -76,9 +76,16 @@ _SKIPPED = frozenset({BulkItemRow.__tablename__})
 
 @dataclass(frozen=True)
 class Usage:
-    """What an owner keeps, and the limit; limit_bytes None: no limit.
+    """What an owner keeps, and the limit of the owner.
 
-    removable_bytes: the part of used_bytes that kept solutions take.
+    Attributes
+    ----------
+    used_bytes
+        Size of the files that the owner keeps.
+    limit_bytes
+        The limit; None: no limit.
+    removable_bytes
+        The part of ``used_bytes`` that kept solutions take.
     """
 
     owner: str
@@ -98,7 +105,7 @@ class Usage:
         return not self.allows(1)
 
     def no_room(self, why: str) -> str:
-        """The message for a full quota. why: a clause that says what could not be done."""
+        """The message for a full quota. The clause ``why`` says what could not be done."""
         assert self.limit_bytes is not None
         return (
             f"expected free room in your quota; {self.used_bytes / MIB:.1f} of {self.limit_bytes / MIB:.1f} MiB are "
@@ -108,7 +115,13 @@ class Usage:
 
 
 class OverQuota(Exception):
-    """A file does not fit into the owner's quota. usage: the owner's usage without it."""
+    """A file does not fit into the owner's quota.
+
+    Attributes
+    ----------
+    usage
+        The owner's usage without this file.
+    """
 
     def __init__(self, usage: Usage) -> None:
         super().__init__(usage.owner)
@@ -119,18 +132,34 @@ class Quotas(Queries):
     """The limits of owners, and what they keep."""
 
     def usage(self, owner: str, quota_mib: int) -> Usage:
-        """The usage of an owner. quota_mib: the limit if the owner has no individual limit; 0: unlimited."""
+        """The usage of an owner.
+
+        Parameters
+        ----------
+        quota_mib
+            The limit if the owner has no individual limit, MiB; 0: unlimited.
+        """
         with self._database.reading() as session:
             return _usage(session, owner, _limit_mib(session, owner, quota_mib))
 
     def limited(self, owner: str, quota_mib: int) -> Usage | None:
-        """The usage of an owner who has a limit; None if there is no limit. quota_mib: as for ``usage``."""
+        """The usage of an owner who has a limit; None if there is no limit.
+
+        Parameters
+        ----------
+        quota_mib
+            The limit if the owner has no individual limit, MiB; 0: unlimited.
+        """
         with self._database.reading() as session:
             return _limited(session, owner, quota_mib)
 
     def all(self, quota_mib: int) -> list[Usage]:
-        """The usage of all owners who keep files, made a key or have an individual limit. quota_mib: as for
-        ``usage``.
+        """The usage of all owners who keep files, made a key or have an individual limit.
+
+        Parameters
+        ----------
+        quota_mib
+            The limit of owners who have no individual limit, MiB; 0: unlimited.
         """
         with self._database.reading() as session:
             tables: tuple[type[OwnerRow | FileRow], ...] = (OwnerRow, *WITH_FILES)
@@ -196,7 +225,11 @@ class NamedFiles(Queries):
     def all(self, *, solutions_from: float = -math.inf) -> Iterator[str]:
         """Every hash in the database; a hash may occur more than once. Rows are read in batches.
 
-        solutions_from: solutions that were stored before this time are left out.
+        Parameters
+        ----------
+        solutions_from
+            The time from which solutions are read, in seconds since 1970; solutions that were stored earlier are left
+            out.
         """
         for table in Base.metadata.sorted_tables:
             if table.name not in _SKIPPED:
@@ -259,9 +292,18 @@ def lock_owner(session: Session, owner: str) -> None:
 def hold_to_quota(session: Session, row: FileRow, quota_mib: int) -> None:
     """Check the file of a row that this transaction has just added. Call ``lock_owner`` before the row is added.
 
-    If the file does not fit, the owner's oldest kept solutions are removed until it fits. If it would not fit even
-    without any kept solution, raises OverQuota. If several uploads fit one by one but not together, the last ones are
-    refused. quota_mib: as for ``Quotas.usage``.
+    If the file does not fit, the owner's oldest kept solutions are removed until it fits. If several uploads fit one by
+    one but not together, the last ones are refused.
+
+    Parameters
+    ----------
+    quota_mib
+        The limit if the owner has no individual limit, MiB; 0: unlimited.
+
+    Raises
+    ------
+    OverQuota
+        The file would not fit even without any kept solution.
     """
     now = _limited(session, row.owner, quota_mib)
     if now is None or now.limit_bytes is None:

@@ -87,7 +87,7 @@ class Schema:
     """Inspects the tables of the database and upgrades them."""
 
     def __init__(self, database: Database, revisions: Path = REVISIONS) -> None:
-        """revisions: a folder with an ``env.py`` and a folder ``versions``, as Alembic expects them."""
+        """The folder ``revisions`` has an ``env.py`` and a folder ``versions``, as Alembic expects them."""
         self._database = database
         self._revisions = revisions
 

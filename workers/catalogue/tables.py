@@ -55,7 +55,7 @@ _OPEN = text("phase IN ('ERROR', 'LISTING', 'PAUSED', 'RUNNING')")
 
 
 def _listed(table: str, *by: str) -> Index:
-    """An index for lists of an owner's rows, newest first. by: columns by which the list is filtered."""
+    """An index for lists of an owner's rows, newest first, which are filtered by the columns ``by``."""
     return Index("_".join((table, "listed", *(("by", *by) if by else ()))), "owner", *by, "created_at", "id")
 
 
@@ -253,7 +253,7 @@ class PsfPinRow(Base):
 class DefaultContextRow(Change, Base):
     """A change of an owner's default context. The latest row of an owner is valid.
 
-    context_id None: the owner uses the PSFs that are certified now.
+    If ``context_id`` is None, the owner uses the PSFs that are certified now.
     """
 
     __tablename__ = "default_contexts"
@@ -485,7 +485,7 @@ class StageTimeRow(Base):
 
 
 class OwnerRow(Base):
-    """The individual limit of an owner. quota_mib None: the default limit."""
+    """The individual limit of an owner. If ``quota_mib`` is None, the default limit applies."""
 
     __tablename__ = "owners"
     owner: Mapped[str] = mapped_column(String(64), primary_key=True)

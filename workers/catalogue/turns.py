@@ -149,7 +149,10 @@ def _counted(session: Session, query: Select[str]) -> int:
 def _of_others(session: Session, owner: str, queue: Queue, own_before: int) -> int:
     """The number of jobs of other owners that start before the owner's next job.
 
-    own_before: how many jobs of the same owner start before this next job.
+    Parameters
+    ----------
+    own_before
+        Number of jobs of the same owner that start before this next job.
     """
     oldest = select(JobRow.owner).where(JobRow.phase == Phase.QUEUED, JobRow.queue == queue)
     read = oldest.order_by(JobRow.created_at).limit(MOST_READ).subquery()

@@ -39,7 +39,12 @@ class UwsJobs:
     def draft(self, kind: str, given: Mapping[str, object], *, owner: str, **terms: object) -> JobRow:
         """Create a PENDING job with the parameters ``given`` so far. Identical requests do not share it.
 
-        terms: the columns of its ``TermsRow``.
+        Parameters
+        ----------
+        given
+            The parameters that the client has given.
+        **terms
+            The columns of the job's ``TermsRow``.
         """
         job_id = uuid.uuid4().hex
         row = JobRow(
@@ -135,7 +140,12 @@ class UwsJobs:
     ) -> list[JobLine]:
         """The newest ``last`` jobs of an owner, newest first.
 
-        phases: only jobs in these phases; empty: all. from_time: only jobs created at this time or later.
+        Parameters
+        ----------
+        phases
+            The phases of the jobs; empty: all phases.
+        from_time
+            The earliest time at which the jobs were created, in seconds since 1970; None: any time.
         """
         query = select(JobRow.id, JobRow.phase, JobRow.owner, JobRow.created_at, TermsRow.run_id)
         query = query.outerjoin(TermsRow, TermsRow.job_id == JobRow.id).where(JobRow.owner == owner)

@@ -204,9 +204,19 @@ def check_layout(layout: str) -> None:
 
 
 def laid_out(layout: str, values: Mapping[str, FieldValue]) -> PurePosixPath:
-    """The relative path of an output file. values: the values of the fields; None: the image lacks the value.
+    """The relative path of an output file.
 
-    Raises DataError "no-output-name" if a value is missing or the path cannot be used.
+    Parameters
+    ----------
+    layout
+        The path with the names of fields in braces.
+    values
+        The values of the fields; None: the image lacks the value.
+
+    Raises
+    ------
+    DataError
+        "no-output-name" if a value is missing or the path cannot be used.
     """
     text = ""
     for literal, name, form, _ in _parsed(layout):

@@ -51,8 +51,17 @@ def build_for(instrument: str, turn_deg: float) -> PsfBuild:
 def diffraction_build(transit: Mapping[str, object], noise: NoiseFigures | None) -> PsfBuild | None:
     """The build of the diffraction PSF of a transit; None if the transit contains this PSF.
 
-    transit: the entries "noise", "known_psf" and "instrument" of its manifest. noise: of the request. Raises DataError
-    "no-noise-figures" and "no-known-psf".
+    Parameters
+    ----------
+    transit
+        The entries "noise", "known_psf" and "instrument" of the manifest of the transit.
+    noise
+        The noise figures of the request; None: the request has none.
+
+    Raises
+    ------
+    DataError
+        "no-noise-figures" and "no-known-psf".
     """
     check_noise(transit, noise)
     if transit["known_psf"] is not None:
@@ -175,7 +184,12 @@ def _transit_identity(
 ) -> str:
     """The identity of the result of a request on a transit.
 
-    excluded: fields of the request that do not change the result. more: further values that determine the result.
+    Parameters
+    ----------
+    excluded
+        Fields of the request that do not change the result.
+    **more
+        Further values that determine the result.
     """
     return canonical_hash(
         {

@@ -72,18 +72,30 @@ class Request(Parameters):
 class Kind:
     """A kind of job.
 
-    | field | meaning |
-    |---|---|
-    | task, assistant | dotted names of functions; other workers run the assistant when a job asks for help |
-    | result | type of the result |
-    | parameters, resolved | models of the parameters as clients send and workers get them; None: not for clients |
-    | identity | from the resolved parameters to the identity of the result; None: every job makes a new one |
-    | resolver | dotted name of the function that resolves the parameters; default: by their ids |
-    | queue | the queue in which jobs of this kind wait by default |
-    | origin | the origin of the PSFs or products of this kind; by it a rerun finds the kind |
-    | needs_room | whether the job starts only if the owner's quota is not full |
-    | counted_whole | whether the reported steps count the whole job, so that the time left can be estimated from them |
-    | memory_advice, time_advice | advice for a request that exceeds the limits; time_advice: None if it is the same |
+    Attributes
+    ----------
+    task, assistant
+        Dotted names of functions. Other workers run the assistant when a job asks for help; if ``assistant`` is None,
+        they cannot help.
+    result
+        Type of the result.
+    parameters, resolved
+        Models of the parameters as clients send them, and as workers get them; None: the kind is not for clients.
+    identity
+        Function from the resolved parameters to the identity of the result; None: every job makes a new result.
+    resolver
+        Dotted name of the function that resolves the parameters; default: by their ids.
+    queue
+        The queue in which jobs of this kind wait by default.
+    origin
+        The origin of the PSFs or products of this kind; by it a rerun finds the kind.
+    needs_room
+        Whether the job starts only if the owner's quota is not full.
+    counted_whole
+        Whether the reported steps count the whole job, so that the time left can be estimated from them.
+    memory_advice, time_advice
+        Advice for a request that exceeds the limit of the memory or of the time. If ``time_advice`` is None,
+        ``memory_advice`` is given for both.
     """
 
     name: str

@@ -31,8 +31,14 @@ if TYPE_CHECKING:
 class Option:
     """How a command names a field of a request, as metadata of its annotation; `service.cli.options` makes the option.
 
-    name: such as "--saturation"; None: the name of the field. metavar: the placeholder of the value. check: raises
-    DataError for a text that is no value.
+    Attributes
+    ----------
+    name
+        Name of the option, such as "--saturation"; None: the name of the field.
+    metavar
+        Placeholder of the value.
+    check
+        Function that raises DataError for a text that is no value.
     """
 
     name: str | None = None

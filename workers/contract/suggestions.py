@@ -17,7 +17,10 @@ SHOWN = 60
 def explained(errors: Iterable[ErrorDetails], model: object) -> Iterator[tuple[ErrorDetails, str]]:
     """Each validation error with its message. The message of an error about an unknown name lists the known names.
 
-    model: the type that was validated. The locations of the errors are relative to it.
+    Parameters
+    ----------
+    model
+        The type that was validated. The locations of the errors are relative to it.
     """
     for error in errors:
         yield error, _message(error, model)

@@ -49,9 +49,15 @@ Position = tuple[str, ...]
 class Entry:
     """A folder or an entry of a folder at which a search looked.
 
-    position: the names of the folders below the fixed part of the pattern, and then the name of the entry; for a folder
-    that is now read, the last name is empty. matches: whether the entry is a file that the pattern matches. error: the
-    error if the entry could not be inspected.
+    Attributes
+    ----------
+    position
+        The names of the folders below the fixed part of the pattern, and then the name of the entry. For a folder that
+        is now read, the last name is empty.
+    matches
+        Whether the entry is a file that the pattern matches.
+    error
+        The error if the entry could not be inspected.
     """
 
     path: Path
@@ -98,8 +104,22 @@ def find(glob: str, allowed: Sequence[Path], after: Position | None = None) -> I
     """Find the files that a pattern matches, and yield every folder and entry at which the search looks, each once.
 
     The entries of a folder are sorted by name; those of its subfolders follow. Links that lead out of the allowed
-    folders are not followed. after: continue a search that ended after this position; what was added or removed before
-    it since then is not noticed. Raises DataError "bad-path", "path-not-allowed", "unreadable-folder".
+    folders are not followed.
+
+    Parameters
+    ----------
+    glob
+        The pattern.
+    allowed
+        The folders below which the search may look.
+    after
+        The position after which an earlier search ended, and this one continues; None: from the beginning. What was
+        added or removed before this position since then is not noticed.
+
+    Raises
+    ------
+    DataError
+        "bad-path", "path-not-allowed", "unreadable-folder".
     """
     folder, parts = _split(glob)
     return _walk(check_under(folder, allowed), parts, allowed, after)
@@ -329,8 +349,19 @@ def make_folder(folder: Path, allowed: Sequence[Path]) -> None:
 def put(source: Path, target: Path, allowed: Sequence[Path], *, replace: bool = True) -> None:
     """Copy a file to a path below an allowed folder in one step: a reader sees either the whole file or no file.
 
-    replace: whether an existing file is replaced. Raises the same DataErrors as ``opened``, and OSError;
-    FileExistsError if there is a file that must not be replaced, even if another process writes it at the same moment.
+    Parameters
+    ----------
+    replace
+        Whether an existing file is replaced.
+
+    Raises
+    ------
+    DataError
+        The same errors as ``opened``.
+    FileExistsError
+        There is a file that must not be replaced, even if another process writes it at the same moment.
+    OSError
+        Another error of the file system.
     """
     with source.open("rb") as file, _folder(target.parent, allowed, make=True) as folder:
         partial = f".{target.name}.{uuid.uuid4().hex}{PARTIAL}"
@@ -365,7 +396,9 @@ def remove_partials(target: Path, allowed: Sequence[Path]) -> None:
 
 @contextmanager
 def _folder(folder: Path, allowed: Sequence[Path], *, make: bool) -> Iterator[int]:
-    """Open a folder below an allowed one, part by part and without following links. make: make the missing parts."""
+    """Open a folder below an allowed one, part by part and without following links. With ``make``, missing parts are
+    made.
+    """
     resolved = check_under(folder, allowed)
     root = next(one for one in allowed if resolved.is_relative_to(one))
     if make:

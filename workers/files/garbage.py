@@ -73,17 +73,28 @@ def intact_row(catalogue: Catalogue, store: Store, table: type[Row], identity: s
 
 @dataclass(frozen=True)
 class Fault:
-    """A row of the catalogue with a lost or damaged file. files: SHA-256 and state of each lost or damaged file."""
+    """A row of the catalogue with a lost or damaged file.
+
+    Attributes
+    ----------
+    files
+        SHA-256 and state of each lost or damaged file.
+    """
 
     row: FileRow
     files: tuple[tuple[str, FileState], ...]
 
 
 def examine(catalogue: Catalogue, store: Store, *, content: bool = True) -> Iterator[Fault]:
-    """Find the rows whose files are lost or damaged.
+    """Find the rows whose files are lost or damaged. Raises ``StoreAway``.
 
-    content: read each file and compare its SHA-256. Otherwise only compare the size of each file with its recorded
-    size, if any. If several rows refer to a file, the file is read once. Raises ``StoreAway``.
+    If several rows refer to a file, the file is read once.
+
+    Parameters
+    ----------
+    content
+        Whether to read each file and compare its SHA-256. Otherwise only the size of each file is compared with its
+        recorded size, if any.
     """
     states: dict[str, FileState] = {}
     for table in WITH_FILES:
@@ -102,7 +113,12 @@ def examine(catalogue: Catalogue, store: Store, *, content: bool = True) -> Iter
 class Collection:
     """The result of a collection: the files of the store, and the removed files.
 
-    removed: in a dry run, the files that would be removed.
+    Attributes
+    ----------
+    files, bytes
+        Number and size of the files in the store.
+    removed
+        The removed files; in a dry run, the files that would be removed.
     """
 
     files: int  # number of files in the store

@@ -28,8 +28,14 @@ MOST_OPEN = 20  # open uploads of one owner
 class PartialUpload:
     """An upload that is not complete yet.
 
-    kind: "transit" or "image". length: size of the whole file, bytes. sha256: the SHA-256 that the client declares for
-    the whole file, in hexadecimal; None if it declares none.
+    Attributes
+    ----------
+    kind
+        "transit" or "image".
+    length
+        Size of the whole file, bytes.
+    sha256
+        The SHA-256 that the client declares for the whole file, in hexadecimal; None if the client declares none.
     """
 
     id: str
@@ -83,7 +89,7 @@ class PartialUploads:
         return next((u for u in self._all() if (u.owner, u.kind, u.length, u.sha256) == wanted), None)
 
     def declared_bytes(self, owner: str, but: str | None = None) -> int:
-        """The sum of the lengths of the owner's open uploads. but: the id of an upload that is left out."""
+        """The sum of the lengths of the owner's open uploads, without the upload whose id is ``but``."""
         self.sweep()
         return sum(one.length for one in self._all() if one.owner == owner and one.id != but)
 

@@ -41,8 +41,14 @@ SILENT = (ReadTimeoutError, ConnectTimeoutError, TimeoutError)
 class Patience:
     """How long a call waits for the store.
 
-    silence_s: longest time until the next byte of an answer. tries: how many times a request is sent if it fails.
-    pause_s: after a call that got no answer, all calls fail at once for this time.
+    Attributes
+    ----------
+    silence_s
+        Longest time until the next byte of an answer, s.
+    tries
+        How many times a request is sent if it fails.
+    pause_s
+        The time for which all calls fail at once after a call that got no answer, s.
     """
 
     silence_s: float
@@ -236,7 +242,10 @@ class RemoteStore(Store):
     def _answering(self, key: str | None = None) -> Iterator[None]:
         """Turn errors of S3 and of the network into ``StoreAway``.
 
-        key: the object that the block reads. FileNotFoundError leaves the block only if this object is absent.
+        Parameters
+        ----------
+        key
+            The object that the block reads. FileNotFoundError leaves the block only if this object is absent.
         """
         if time.monotonic() < self._silent_until:
             raise StoreAway("the object store gave no answer a moment ago: try again later")

@@ -130,10 +130,14 @@ class Store:
             return None
 
     def state(self, digest: str, size: int | None, *, content: bool) -> FileState:
-        """Whether the file with this SHA-256 is good, lost or damaged. size: its recorded size, bytes; None: not
-        recorded.
+        """Whether the file with this SHA-256 is good, lost or damaged.
 
-        content: also read the file and compare its SHA-256.
+        Parameters
+        ----------
+        size
+            Recorded size of the file, bytes; None: not recorded.
+        content
+            Whether to also read the file and compare its SHA-256.
         """
         there = self.size(digest)
         if there is None:
@@ -214,7 +218,10 @@ class Store:
     def keep(self, temporary: Path, digest: str | None = None) -> str:
         """Move a complete file into the store and force it to the disk; returns its SHA-256.
 
-        digest: the SHA-256, if it is already known.
+        Parameters
+        ----------
+        digest
+            The SHA-256, if it is already known; None: it is computed.
         """
         digest = digest or sha256_of(temporary)
         target = self._place(digest)
@@ -310,7 +317,10 @@ def open_store(settings: Settings, *, within_requests: bool = False) -> Store:
     """The store that the settings name: a local folder, or S3. Raises ``MissingExtra`` if the packages for S3 are
     missing.
 
-    within_requests: whether people wait for the answers; calls of S3 then give up earlier.
+    Parameters
+    ----------
+    within_requests
+        Whether people wait for the answers; calls of S3 then give up earlier.
     """
     if settings.store_url is None:
         return Store(settings.data_dir)

@@ -30,8 +30,17 @@ SHOWN_DIGITS = 12
 def check(request: ResolvedDeconvolve, psf: PsfRow | None, header: HeaderJson) -> None:
     """Raise the errors that the job would raise for the headers of its image and its PSF.
 
-    psf: the row of the PSF; None: the PSF is not built yet. header: the header summary that is stored with the image.
-    Codes: "channel-mismatch", "plate-scale-mismatch".
+    Parameters
+    ----------
+    psf
+        The row of the PSF; None: the PSF is not built yet.
+    header
+        The header summary that is stored with the image.
+
+    Raises
+    ------
+    DataError
+        "channel-mismatch", "plate-scale-mismatch".
     """
     cards = header["cards"]
     origin = _origin(request, psf)
@@ -41,8 +50,14 @@ def check(request: ResolvedDeconvolve, psf: PsfRow | None, header: HeaderJson) -
 
 
 def suits(psf: PsfRow | str, header: HeaderJson) -> bool:
-    """Whether the channel and the pixels of an image fit a PSF. psf: its row, or the name of its instrument. header: as
-    in ``check``.
+    """Whether the channel and the pixels of an image fit a PSF.
+
+    Parameters
+    ----------
+    psf
+        The row of the PSF, or the name of its instrument.
+    header
+        The header summary that is stored with the image.
     """
     origin = PsfOrigin.of_instrument(load_instrument(psf)) if isinstance(psf, str) else _origin_of_row(psf)
     try:
@@ -94,8 +109,12 @@ def _origin_of_row(psf: PsfRow) -> PsfOrigin:
 class Deprecation:
     """Why a PSF is deprecated, and what replaces it.
 
-    reason: empty if none was given. redo_with: the certified PSF at the end of the chain of successors; None if there
-    is none.
+    Attributes
+    ----------
+    reason
+        The reason that was given; empty if none was given.
+    redo_with
+        The certified PSF at the end of the chain of successors; None if there is none.
     """
 
     reason: str
@@ -105,8 +124,12 @@ class Deprecation:
 def check_not_deprecated(catalogue: Catalogue, psf_id: str, owner: str, what: str, ways: str) -> None:
     """Raise ``DataError`` "psf-deprecated" if the PSF that the service would choose is deprecated.
 
-    what: the name of the PSF in the message. ways: advice for the user; it may contain {psf}, which stands for the
-    PSF's id.
+    Parameters
+    ----------
+    what
+        The name of the PSF in the message.
+    ways
+        Advice for the user. It may contain {psf}, which stands for the first digits of the PSF's id.
     """
     row = catalogue.get(PsfRow, psf_id, owner)
     if row is None or row.status != PsfStatus.DEPRECATED:

@@ -14,10 +14,18 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Cost:
-    """Time (s, and ns for each pixel that the job reads) and memory (MiB, and bytes for each pixel) of a kind of job.
+    """The time and the memory that a kind of job needs.
 
-    times: factors of the time, by the names of the parameters that cause them if the request sets them. runs: by
-    scheme, what each run adds to the time, as a share of it.
+    Attributes
+    ----------
+    base_s, pixel_ns
+        Time of the job, s, and further time for each pixel that the job reads, ns.
+    base_mib, pixel_bytes
+        Memory of the job, MiB, and further memory for each pixel, bytes.
+    times
+        Factors of the time, by the names of the parameters that cause them if the request sets them.
+    runs
+        The share of the time that each run adds to it, by scheme.
     """
 
     base_s: float

@@ -62,7 +62,13 @@ _times: WeakKeyDictionary[Catalogue, dict[str, tuple[list[tuple[float, float]], 
 
 @dataclass(frozen=True)
 class Estimate:
-    """The expected time and memory of a job. ``start_s``: the estimated time before the measured factor is applied."""
+    """The expected time and memory of a job.
+
+    Attributes
+    ----------
+    start_s
+        The estimated time before the measured factor is applied, s.
+    """
 
     memory_mib: int
     seconds: float
@@ -176,8 +182,12 @@ def _deconvolution(parameters: Mapping[str, Any], catalogue: Catalogue, owner: s
 def estimate_build(
     parameters: Mapping[str, Any], catalogue: Catalogue | None = None, owner: str = ""
 ) -> tuple[float, float]:
-    """The processor time, s, and the memory, MiB, of a PSF build. catalogue: of the mask image; None: the build has
-    none.
+    """The processor time, s, and the memory, MiB, of a PSF build.
+
+    Parameters
+    ----------
+    catalogue
+        The catalogue that contains the mask image; None: the build has no mask image.
     """
     size = max(parameters["size"], REACH_GRID_PX)
     grid = size / REACH_GRID_PX

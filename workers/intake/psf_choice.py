@@ -115,11 +115,14 @@ class SearchResult:
 
 
 def look(catalogue: Catalogue, wanted: PsfFilter, owner: str, context: str | None) -> SearchResult:
-    """The PSFs that meet the filters. context: an id, a name or "now"; None: the owner's default context.
+    """The PSFs that meet the filters. Raises ``DataError`` "no-such-context".
 
     If there is no context, and the filters name no status, only certified PSFs are searched.
 
-    Raises ``DataError`` "no-such-context".
+    Parameters
+    ----------
+    context
+        An id, a name or "now"; None: the owner's default context.
     """
     return _look(catalogue, wanted, owner, catalogue.contexts.for_request(context, owner))
 
@@ -136,11 +139,21 @@ def _look(catalogue: Catalogue, wanted: PsfFilter, owner: str, pinned: PsfContex
 def look_for_image(
     catalogue: Catalogue, header: HeaderJson, owner: str, context: str | None, kind: str = TOTAL
 ) -> SearchResult:
-    """The PSFs for the instrument, channel and time of an image. header: the header summary that is stored with the
-    upload.
+    """The PSFs for the instrument, channel and time of an image.
 
     If the channel has variants, the filter and the plate scale in the header choose the variant.
-    Raises ``DataError`` "no-instrument", "no-date", "no-such-context" or "several-variants-fit".
+
+    Parameters
+    ----------
+    header
+        The header summary that is stored with the upload.
+    context
+        An id, a name or "now"; None: the owner's default context.
+
+    Raises
+    ------
+    DataError
+        "no-instrument", "no-date", "no-such-context" or "several-variants-fit".
     """
     pinned = catalogue.contexts.for_request(context, owner)
     instrument, channel = _seen_as(catalogue, header, owner, pinned, kind)
@@ -204,7 +217,7 @@ def picked_for_image(
 
 
 def seen_through(header: HeaderJson) -> tuple[str | None, str | None]:
-    """The instrument and the channel of an image. header: the header summary that is stored with the upload."""
+    """The instrument and the channel of an image, from the header summary that is stored with the upload."""
     instrument = instrument_of(header)
     return instrument, channel_of(instrument, header["wavelnth"])
 
@@ -244,7 +257,12 @@ def reasoned_psf(
 ) -> ChosenPsf:
     """The PSF that was chosen for a request, with a sentence that says why.
 
-    wanted: the parameters of the request. resolved: the same parameters after ``workers.intake.requests.resolve``.
+    Parameters
+    ----------
+    wanted
+        The parameters of the request.
+    resolved
+        The same parameters after ``workers.intake.requests.resolve``.
     """
     row = catalogue.get(PsfRow, resolved.psf_id, owner)
     if row is not None:

@@ -63,11 +63,18 @@ def resolve(
 ) -> tuple[dict[str, Any], str]:
     """Resolved parameters, and the identity of the job's result.
 
-    added_effects: modules with effects that the operator adds to the library of a gap diagnosis. Raises ``DataError``
-    "no-such-image", "no-such-psf", "no-such-transit", "no-such-product", "no-psf-for-instrument", "psf-deprecated",
-    "no-noise-figures", "no-known-psf", "unknown-instrument", "bad-instrument-file", "already-deconvolved",
-    "psf-as-image", "channel-mismatch" or "plate-scale-mismatch", and the errors of ``workers.intake.psf_choice`` and
-    ``workers.lineage.made_by``.
+    Parameters
+    ----------
+    added_effects
+        Modules with effects that the operator adds to the library of a gap diagnosis.
+
+    Raises
+    ------
+    DataError
+        "no-such-image", "no-such-psf", "no-such-transit", "no-such-product", "no-psf-for-instrument", "psf-deprecated",
+        "no-noise-figures", "no-known-psf", "unknown-instrument", "bad-instrument-file", "already-deconvolved",
+        "psf-as-image", "channel-mismatch" or "plate-scale-mismatch", and the errors of ``workers.intake.psf_choice``
+        and ``workers.lineage.made_by``.
     """
     kind = KINDS[request.kind]
     resolver = load(kind.resolver)

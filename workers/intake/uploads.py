@@ -17,7 +17,13 @@ TEXT_LENGTH = 200
 
 
 class Upload(NamedTuple):
-    """A file that an owner sent. filename: the name that the client gave to it, if any."""
+    """A file that an owner sent.
+
+    Attributes
+    ----------
+    filename
+        The name that the client gave to the file, if any.
+    """
 
     owner: str
     sha256: str

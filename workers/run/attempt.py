@@ -48,8 +48,11 @@ class Attempt:
     """A claimed job while it runs. The first report of progress later than ``max_job_s`` after ``started`` stops the
     job.
 
-    child: this process; None if it must not be ended. The process is ended if the job must stop but still runs
-    ``cancel_s`` later, or if the thread of the heartbeats cannot run for ``silent_s``.
+    Attributes
+    ----------
+    child
+        This process; None if it must not be ended. The process is ended if the job must stop but still runs
+        ``cancel_s`` later, or if the thread of the heartbeats cannot run for ``silent_s``.
     """
 
     catalogue: Catalogue

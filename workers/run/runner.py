@@ -63,9 +63,17 @@ class Runner:
         submit: Callable[[str, Queue], bool] = lambda job_id, queue: False,
         child: Child | None = None,
     ) -> None:
-        """submit: a function that sends an unfinished job to the broker again; if it returns False, the reconciler
-        does so. child: this process, if the runner may limit the memory of the process and end it; None if it may do
-        neither.
+        """Run jobs with these settings, catalogue and store.
+
+        Parameters
+        ----------
+        call_for_help
+            Function of the id of a job and a number of workers, which asks up to this number of idle workers to share
+            the job.
+        submit
+            Function that sends an unfinished job to the broker again; if it returns False, the reconciler does so.
+        child
+            This process, if the runner may limit the memory of the process and end it; None if it may do neither.
         """
         self._settings, self._catalogue, self._store = settings, catalogue, store
         self._call_for_help, self._submit = call_for_help, submit
@@ -125,7 +133,7 @@ class Runner:
             self._keep_times(job, assistance.times)
 
     def _workspace(self, job: JobRow, work: Attempt | Assistance, **functions: Any) -> CatalogueWorkspace:
-        """The workspace of a task or an assistant. functions: what only a task may use."""
+        """The workspace of a task or an assistant. Only a task may use the ``functions``."""
         return CatalogueWorkspace(
             catalogue=self._catalogue,
             store=self._store,

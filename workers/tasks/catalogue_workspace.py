@@ -50,10 +50,16 @@ def _not_alone(_work: Callable[[], None]) -> JobError | None:
 class CatalogueWorkspace(Workspace):
     """The workspace of a job of the service.
 
-    call_for_help(n): asks up to n idle workers to share the parts of the job.
-    guarded(work): runs one piece of a job that has many pieces; returns the error of the piece, or None.
-    others_wait(): True if other jobs wait, so that a job of many pieces should raise ``TurnOver``.
-    lease: the lease under which a job takes its pieces.
+    Attributes
+    ----------
+    call_for_help
+        Function of a number n that asks up to n idle workers to share the parts of the job.
+    guarded
+        Function that runs one piece of a job that has many pieces; returns the error of the piece, or None.
+    others_wait
+        Function that returns True if other jobs wait, so that a job of many pieces should raise ``TurnOver``.
+    lease
+        The lease under which a job takes its pieces.
     """
 
     catalogue: Catalogue

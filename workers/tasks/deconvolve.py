@@ -54,7 +54,12 @@ def make(
 ) -> Result:
     """Deconvolve an image and measure the changes; the result is a product whose files are not yet written.
 
-    read: reads the image. preview: whether the result has a picture of the image before and after.
+    Parameters
+    ----------
+    read
+        Function that reads the image.
+    preview
+        Whether the result has a picture of the image before and after.
     """
 
     def begin(stage: str, steps: int) -> Callable[[int, int], None]:
@@ -90,7 +95,17 @@ def product_result(
     job_id: str,
     preview: bool = True,
 ) -> Result:
-    """The product of a request, whose files are not yet written. psf: as the cards name it. details: of the product."""
+    """The product of a request, whose files are not yet written.
+
+    Parameters
+    ----------
+    psf
+        The PSF as the cards of the product name it.
+    details
+        The details of the product.
+    preview
+        Whether the result has a picture of the image before and after.
+    """
     identity = product_identity(request)
     # The name depends only on the content of the input and on the request.
     filename = safe_name(optional_text(product.image.header, "FILENAME") or "heliopsf", identity)

@@ -131,7 +131,7 @@ def report_result(
 
 
 def provenance_of(job_id: str, request: Parameters) -> dict[str, object]:
-    """The inputs, parameters and software versions with which a job makes its result. request: the resolved
+    """The inputs, parameters and software versions with which a job makes its result. ``request`` contains the resolved
     parameters.
     """
     transit_id = getattr(request, "transit_id", None)

@@ -35,7 +35,13 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class KeptSolutions:
-    """The kept solutions of an owner, as a job uses them. anew: the job is a rerun."""
+    """The kept solutions of an owner, as a job uses them.
+
+    Attributes
+    ----------
+    anew
+        Whether the job is a rerun.
+    """
 
     catalogue: Catalogue
     store: Store
@@ -58,8 +64,17 @@ class KeptSolutions:
         """The solution of a transit: the owner's stored solution if it exists; otherwise a new solution.
 
         A new solution is stored if the owner's quota allows it. A rerun always computes a new solution and does not
-        store it. transit: as ``load_transit`` returns it for the request; only its noise may be replaced. Raises
-        DataError as ``psfcore.scatter.inversion.invert`` does.
+        store it.
+
+        Parameters
+        ----------
+        transit
+            The transit as ``load_transit`` returns it for the request; only its noise may be replaced.
+
+        Raises
+        ------
+        DataError
+            The errors of ``psfcore.scatter.inversion.invert``.
         """
         identity = solution_identity(request, transit, shape, start)
         kept = None if self.anew else self._kept(identity, transit, threads)

@@ -17,10 +17,16 @@ def load_transit(
 ) -> tuple[Transit, Prepared]:
     """Unpack, read and prepare the transit that a request names.
 
-    diffraction: the diffraction PSF to use if the transit contains none; None: build it from the request's recipe. It
-    is not cropped to the field of view: its kernel of 2048 × 2048 px sums to 1.
+    Parameters
+    ----------
+    diffraction
+        The diffraction PSF to use if the transit contains none; None: build it from the request's recipe. The PSF is
+        not cropped to the field of view: its kernel of 2048 × 2048 px sums to 1.
 
-    Raises DataError "no-such-transit", "no-known-psf", and the errors of unpacking and preparing.
+    Raises
+    ------
+    DataError
+        "no-such-transit", "no-known-psf", and the errors of unpacking and preparing.
     """
 
     def known(_instrument: str | None, _shape: tuple[int, int]) -> Kernel:

@@ -91,9 +91,16 @@ def task_of(kind: str) -> Callable[[Callable[[Any, Any, str], None]], Task]:
 class Workspace(ABC):
     """What every task may use.
 
-    report(stage, step, steps): reports progress; raises an exception if the job must stop. times: measures the time of
-    the reported stages. If the pieces of a job report their own stages, the time of these stages is measured instead.
-    anew: True for a rerun: compute everything again.
+    Attributes
+    ----------
+    report
+        Function of a stage, a step and the number of steps that reports progress; it raises an exception if the job
+        must stop.
+    times
+        The timer of the reported stages. If the pieces of a job report their own stages, the time of these stages is
+        measured instead.
+    anew
+        Whether the job is a rerun, which must compute everything again.
     """
 
     settings: Settings
@@ -136,13 +143,17 @@ class Workspace(ABC):
 
     @abstractmethod
     def psf(self, identity: str, *, parts: bool = True) -> Psf:
-        """The PSF with this id; parts: whether with its components and errors. Raises DataError "no-such-psf"."""
+        """The PSF with this id, with its components and errors if ``parts`` is True. Raises DataError "no-such-psf"."""
 
     def build(
         self, recipe: Recipe, mount_image: NDArray[np.floating] | None, progress: Callable[[int, int], None]
     ) -> tuple[Psf, Callable[[Path], object]]:
-        """The PSF of a recipe, and a function that writes its file. mount_image: the pixels of the mask image of its
-        mount, if it has one.
+        """The PSF of a recipe, and a function that writes its file.
+
+        Parameters
+        ----------
+        mount_image
+            The pixels of the mask image of the instrument's mount, if it has one.
         """
         # Most jobs do not load the libraries of the diffraction.
         from psfcore.build import build_recipe
@@ -168,7 +179,10 @@ class Workspace(ABC):
     def parts(self, identity: str, count: int, compute: Callable[[int, Progress], Json]) -> Sequence[Json]:
         """The results of all parts of a job: ``compute(number, progress)`` for each number below ``count``.
 
-        identity: of the job's result; other workers may compute parts of it.
+        Parameters
+        ----------
+        identity
+            The identity of the job's result; other workers may compute parts of this result.
         """
         done: list[Json] = []
         for number in range(count):
