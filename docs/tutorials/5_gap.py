@@ -106,6 +106,6 @@ for name in ("dark_offset", "intensity_gradient", "column_smear", "ghost"):
 # - ``tie``: ``report["would_separate"]`` names the observation that would separate the effects.
 # - ``none``: no gap was found. The limits state how strong an effect can still be.
 # - ``unknown`` or ``inconclusive``: at least one alternative is a form that the library does not have.
-# ``report["causes"]`` has its family, and where possible a map or a curve of it; see :doc:`the gap diagnosis </gap>`,
-# which also states how often the diagnosis is right. :doc:`Two real transits </real_transits>` shows what can be said
-# without a diagnosis.
+#   ``report["causes"]`` has its family, and where possible a map or a curve of it; see
+#   :doc:`the gap diagnosis </gap>`, which also states how often the diagnosis is right.
+#   :doc:`Two real transits </real_transits>` shows what can be said without a diagnosis.

@@ -147,7 +147,7 @@ print(f"centre inside the disc: {inside.sum()} pixels; fully dark: {dark.sum()} 
 # -------------------
 #
 # - The fit: :doc:`4_transit` compares a fitted PSF with the known PSF. ``heliopsf simulate bound`` computes the
-# smallest error that photon noise and read noise allow.
+#   smallest error that photon noise and read noise allow.
 # - The PSFs of AIA: :doc:`the comparison of all channels </aia>` with those of aiapy.
 # - :doc:`The gap diagnosis </gap>`: this page states how often it is right on simulated transits whose effect is
-# withheld.
+#   withheld.

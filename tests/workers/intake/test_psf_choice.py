@@ -132,8 +132,8 @@ def test_a_context_keeps_whether_a_series_is_interpolated(certified: Catalogue) 
     never, _ = certified.contexts.create("never", OWNER, "x")
     allow(certified)
     always, _ = certified.contexts.create("always", OWNER, "x")
-    assert {pin.interpolated for pin in certified.contexts.pins(never.id, OWNER)} == {False}
-    assert {pin.interpolated for pin in certified.contexts.pins(always.id, OWNER)} == {True}
+    assert {one.interpolated for one in certified.contexts.pins(never.id, OWNER)} == {False}
+    assert {one.interpolated for one in certified.contexts.pins(always.id, OWNER)} == {True}
     message = refused("name-taken", lambda: certified.contexts.create("never", OWNER, "x"))
     assert "interpolated" in message
     assert interpolation(certified, "2021-06-01", "never") is None
