@@ -68,8 +68,12 @@ def label_of(names: Sequence[str]) -> str:
 def fit_effects(model: LinearModel, effects: Sequence[Effect], *, any_sign: bool = False) -> EffectFit:
     """Fit the coordinates of the PSF together with these effects.
 
-    A parameter that must be positive is left out if its fitted value is not positive. any_sign: keep all parameters,
-    whatever their sign.
+    A parameter that must be positive is left out if its fitted value is not positive.
+
+    Parameters
+    ----------
+    any_sign
+        Whether to keep all parameters, whatever their sign.
     """
     columns = {
         column: (effect, parameter)
