@@ -26,8 +26,12 @@ Stage = Literal["scene", "optics", "detector"]
 class EffectParameter:
     """A parameter of an effect.
 
-    likely: the largest plausible size of the parameter, in its unit; ten times this size is hardly credible. positive:
-    whether the parameter cannot be negative, for example because it is a share of light.
+    Attributes
+    ----------
+    likely
+        The largest plausible size of the parameter, in its unit; ten times this size is hardly credible.
+    positive
+        Whether the parameter cannot be negative, for example because it is a share of light.
     """
 
     name: str
