@@ -23,7 +23,13 @@ MOST_STEPS = 1000  # far beyond the point from which steps fit the noise
 
 @dataclass(frozen=True)
 class Parameter:
-    """A number that a method takes, from ``least`` to ``most``. about: what it means, for a description."""
+    """A number that a method takes, from ``least`` to ``most``.
+
+    Attributes
+    ----------
+    about
+        The meaning of the number, for a description.
+    """
 
     name: str
     default: Value

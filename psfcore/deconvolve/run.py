@@ -224,11 +224,19 @@ def deconvolve(
 ) -> Product:
     """Deconvolve an image, or the box of it that the options name.
 
-    psf: the PSF on the pixels of the image. warnings: those of `input_warnings`, and others about the inputs.
-    possible_psfs, begin: see `Work.errors`. check_plane: called with the shape (ny, nx) of box and rim, which is known
-    only after the image is read; it may raise.
-
     Raises DataError "no-noise-figures", "no-noise-model", and the errors of `box_work` and of the method.
+
+    Parameters
+    ----------
+    psf
+        The PSF on the pixels of the image.
+    warnings
+        The warnings of `input_warnings`, and others about the inputs.
+    possible_psfs, begin
+        Functions for the error planes and the progress, see `Work.errors`.
+    check_plane
+        Function that is called with the shape (ny, nx) of box and rim, which is known only after the image is read; it
+        may raise.
     """
     if options.noise is None and options.parameters.get("stop") == "discrepancy":
         raise no_noise_model()  # measured noise is too uncertain to end an iteration
@@ -302,7 +310,12 @@ class PsfSource:
 
     def on_pixels_of(self, header: Header, load: Callable[[], Psf]) -> tuple[Psf, Psf, str | None]:
         """The PSF as it is read or built, the PSF on the pixels of an image with this header, and the answer of
-        `check_channel`. load: calls `load` of this source.
+        `check_channel`.
+
+        Parameters
+        ----------
+        load
+            Function that calls `load` of this source.
         """
         of_telescope = known_instrument(header), frame_of(header).turn_to_build_deg
         key = (of_telescope if self.key is None else self.key, self.plate_scale_arcsec)
@@ -400,7 +413,7 @@ def read_and_deconvolve(
 
 
 def write(product: Product, path: Path, psf: UsedPsf, ids: Identities) -> None:
-    """Write a product as a FITS file. psf: as the cards name it."""
+    """Write a product as a FITS file whose cards name the PSF as `psf` does."""
     own = described(
         product.image.header,
         filename=ids.filename,
