@@ -129,8 +129,12 @@ def _unit_without_card(header: Cards, matrix: Matrix) -> str:
 
 
 def plate_scale_arcsec(header: Cards, axis: int = 1) -> float | None:
-    """Plate scale of an axis, arcsec/px; None if the header does not give it in a unit of angle. axis: 1 for x, 2 for
-    y.
+    """Plate scale of an axis, arcsec/px; None if the header does not give it in a unit of angle.
+
+    Parameters
+    ----------
+    axis
+        Number of the axis: 1 for x, 2 for y.
     """
     return frame_of(header).scale_arcsec[axis - 1]
 
