@@ -113,7 +113,12 @@ class TotalPsf:
 def curve_sigma(slopes: Iterable[Kernel], covariance: Matrix, radii_px: Vector) -> Vector:
     """The standard error of C(R) = 100 (1 - encircled energy) of a kernel, in percent, one for each radius (px).
 
-    slopes: the derivatives of the kernel with respect to the coordinates. covariance: that of the coordinates.
+    Parameters
+    ----------
+    slopes
+        The derivatives of the kernel with respect to the coordinates.
+    covariance
+        Covariance matrix of the coordinates.
     """
     of_curve = np.stack([-100 * encircled_energy(slope, radii_px) for slope in slopes], axis=1)
     variance = np.einsum("rk,kl,rl->r", of_curve, covariance, of_curve)
@@ -228,8 +233,12 @@ class Optics(Blur):
         return self._through(lanes, self._inverse, conjugate=adjoint)
 
     def invert(self, observed: Lanes, start: Lanes | None = None, *, steps: int = STEPS) -> Lanes:
-        """The scene x of an observation, from `steps` iterations of Eq. (1). start: first estimate (default:
-        observed).
+        """The scene x of an observation, from `steps` iterations of Eq. (1).
+
+        Parameters
+        ----------
+        start
+            First estimate; default: the observation.
         """
         first = observed if start is None else start
         return solve_linear(self.engine, self._inverse, observed, first, steps)  # Eq. (1)
