@@ -131,9 +131,15 @@ def correlations(
 ) -> NDArray[np.floating]:
     """Correlate planes with a scene: for each displacement d, sum plane(x) scene(x - d) over all pixels x.
 
-    planes: shape (k, ny, nx). scene: shape (ny + 2 reach_px, nx + 2 reach_px); its inner (ny, nx) pixels are the pixels
-    of the planes. d runs from -reach_px to reach_px along each axis. The result has the shape
-    (k, 2 reach_px + 1, 2 reach_px + 1); d = 0 is in the middle.
+    d runs from -reach_px to reach_px along each axis. The result has the shape (k, 2 reach_px + 1, 2 reach_px + 1); d =
+    0 is in the middle.
+
+    Parameters
+    ----------
+    planes
+        The planes (k, ny, nx).
+    scene
+        The scene (ny + 2 reach_px, nx + 2 reach_px); its inner (ny, nx) pixels are the pixels of the planes.
     """
     length = tuple(int(scipy.fft.next_fast_len(n, real=True)) for n in scene.shape)
     wide = scipy.fft.rfft2(planes, s=length)

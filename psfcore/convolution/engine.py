@@ -205,15 +205,24 @@ class Engine:
         self.row_stage(_rows_inverse, lanes)
 
     def columns(self, *, adjoint: bool) -> None:
-        """Transform the columns, multiply by the transfer function, and transform back. adjoint: multiply by its
-        conjugate.
+        """Transform the columns, multiply by the transfer function, and transform back.
+
+        Parameters
+        ----------
+        adjoint
+            Whether to multiply by the conjugate of the transfer function.
         """
         self.multiply_columns(self.transfer, conjugate=adjoint)
 
     def multiply_columns(self, transfer: Single, *, conjugate: bool = False) -> None:
-        """As ``columns``, but with a given filter. transfer: the filter, in the same layout as the transfer function.
+        """As ``columns``, but with a given filter.
 
-        conjugate: multiply by the complex conjugate of the filter.
+        Parameters
+        ----------
+        transfer
+            The filter, in the same layout as the transfer function.
+        conjugate
+            Whether to multiply by the complex conjugate of the filter.
         """
         self._stage(_columns, self.column_plan, self.column_blocks, transfer, conjugate)
 
@@ -404,7 +413,13 @@ def _clear(buffer: Single, filled: int, length: int) -> None:
 
 @compiled()
 def _rows_forward(lines: Lines, start: int, stop: int, lanes: Single, first_block: int) -> None:
-    """Transform the rows of blocks. first_block: the block of the spectrum to which block 0 of `lanes` belongs."""
+    """Transform the rows of blocks.
+
+    Parameters
+    ----------
+    first_block
+        The block of the spectrum to which block 0 of `lanes` belongs.
+    """
     nx = lanes.shape[1]
     for block in range(start, stop):
         _copy(lanes[block].reshape(-1), lines.buffer, nx * _SIZE)
