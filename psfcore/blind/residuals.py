@@ -56,7 +56,13 @@ class LinearEstimator:
         self._observed = [float(clean.observed(n).mean()) for n in images]
 
     def left_pct(self, images: Sequence[Plane]) -> float:
-        """Eq. (2) after the refit, percent. images: all images with the effect [y, x], DN/s."""
+        """Eq. (2) after the refit, percent.
+
+        Parameters
+        ----------
+        images
+            All images with the effect [y, x], DN/s.
+        """
         clean = self._clean
         frames = (
             replace(frame, pixels=pixels) for frame, pixels in zip(clean.transit.frames, images, strict=True)

@@ -31,7 +31,10 @@ _REALISATIONS_STREAM, _NOISE_STREAM = 2001, 2002
 class EffectFree:
     """A plan, its telescope and its scenes without any effect.
 
-    scenes: fine scenes [y, x], DN/s, by pointing. Along each axis, FINE fine pixels cover one detector pixel.
+    Attributes
+    ----------
+    scenes
+        Fine scenes [y, x], DN/s, by pointing. Along each axis, FINE fine pixels cover one detector pixel.
     """
 
     plan: Plan

@@ -156,8 +156,14 @@ def declare(
     options: Mapping[str, Any] | None = None,
     **draw: Draw,
 ) -> Callable[[Function], Function]:
-    """Add the decorated function to EFFECTS, under its own name. options: further fields of `EffectKind`. draw: its
-    parameters.
+    """Add the decorated function to EFFECTS, under its own name.
+
+    Parameters
+    ----------
+    options
+        Further fields of `EffectKind`.
+    draw
+        The parameters of the effect, and how each is drawn.
     """
 
     def add(change: Function) -> Function:
@@ -216,7 +222,12 @@ def unit_coordinates(
 ) -> tuple[Plane, Plane]:
     """Coordinates of the pixels [y, x] along and across a direction, in widths of the field, from a point.
 
-    angle_deg: the direction, from +x towards +y. at: the point (x, y), fractions of the field.
+    Parameters
+    ----------
+    angle_deg
+        The direction, from +x towards +y.
+    at
+        The point (x, y), fractions of the field.
     """
     ny, nx = shape
     u, v = (np.arange(nx)[None, :] + 0.5) / nx - at[0], (np.arange(ny)[:, None] + 0.5) / ny - at[1]
@@ -245,8 +256,12 @@ def seed(plan: Plan, rng: np.random.Generator) -> int:
 
 
 def near_a_disc(spread: float) -> Callable[[Plan, np.random.Generator], tuple[float, float]]:
-    """Draws a point (x, y), fractions of the field, near a random position of the occulter. spread: rms distance per
-    axis.
+    """A function that draws a point (x, y), fractions of the field, near a random position of the occulter.
+
+    Parameters
+    ----------
+    spread
+        Rms distance of the points from this position per axis.
     """
 
     def draw(plan: Plan, rng: np.random.Generator) -> tuple[float, float]:

@@ -55,8 +55,12 @@ def one_sided_scatter(effect: Effect, optics: FineOptics, moment: Moment) -> Fin
 
 
 def rescaled(optics: FineOptics, falloff: Plane, before: Plane) -> FineOptics:
-    """The telescope with another falloff of the scatter; the total of the scatter stays the same. before: the old
-    falloff.
+    """The telescope with another falloff of the scatter; the total of the scatter stays the same.
+
+    Parameters
+    ----------
+    before
+        The old falloff.
     """
     amplitude = optics.law.a / FINE**2 * float(before.sum() / falloff.sum())
     return dataclasses.replace(optics, scatter=scaled_scatter(falloff, optics.law, amplitude))
@@ -102,7 +106,13 @@ def _blurred(optics: FineOptics, blur: Plane) -> FineOptics:
 
 
 def _sampled(reach_px: float, profile: Callable[[Plane, Plane], Plane]) -> Plane:
-    """A kernel [y, x] on fine pixels with the sum 1. profile: its value at x and y, detector px, up to reach_px."""
+    """A kernel [y, x] on fine pixels with the sum 1.
+
+    Parameters
+    ----------
+    profile
+        Function of x and y, detector px, that gives the value of the kernel, up to reach_px.
+    """
     half = int(np.ceil(reach_px * FINE)) + 1
     n = 2 * half + 1
     at = ((np.arange(n * _FINER) + 0.5) / _FINER - half - 0.5) / FINE

@@ -159,8 +159,12 @@ def saturation_fill(effect: Effect, scene: Plane, moment: Moment) -> Plane:
 
 @cache
 def patches(size: int, seed: int, patch: float) -> Plane:
-    """A smooth random plane [y, x] with mean 0 and rms 1. patch: the size of its patches, as a fraction of the
-    field.
+    """A smooth random plane [y, x] with mean 0 and rms 1.
+
+    Parameters
+    ----------
+    patch
+        The size of the patches, as a fraction of the field.
     """
     rng = np.random.default_rng(seed)
     coarse = max(8, int(np.ceil(4 / patch)))
