@@ -31,7 +31,10 @@ _STATUS = re.compile(r'^status = "draft" +# (.+)$', re.MULTILINE)
 def version_text(version: str, status: str, identity: str | None = None) -> str:
     """The version of a PSF that is built from an instrument file with this version and status.
 
-    identity: of its recipe; None: it has no recipe.
+    Parameters
+    ----------
+    identity
+        Identity of the recipe of the PSF; None: the PSF has no recipe.
     """
     draft = f"-{DRAFT}" if status == DRAFT else ""
     return f"{version}{draft}{'' if identity is None else f'+{identity[:8]}'}"

@@ -235,7 +235,13 @@ def unknown_instrument(header: Observation, psfs: Sequence[SuitedPsf] = ()) -> D
 
 
 def _seen(named: str, telescope: Telescope | None, header: Observation) -> str:
-    """The telescope and the channel of an image, for a message. named: the words of its header cards."""
+    """The telescope and the channel of an image, for a message.
+
+    Parameters
+    ----------
+    named
+        The words of the header cards of the image.
+    """
     channel = channel_of(None, header["wavelnth"])
     cards = f"'{named or 'an unnamed instrument'}'"
     return (f"{telescope.name} ({cards})" if telescope else cards) + (
