@@ -63,9 +63,14 @@ class CachedPsf:
 
 
 class PsfCache:
-    """Keeps the files of PSFs by identity. max_bytes: the largest size of all files; 0: nothing is kept.
+    """Keeps the files of PSFs by identity.
 
     Files in a folder that belongs to another user are not used, because that user could change them.
+
+    Parameters
+    ----------
+    max_bytes
+        The largest size of all files, bytes; 0: nothing is kept.
     """
 
     def __init__(self, folder: Path, max_bytes: int) -> None:

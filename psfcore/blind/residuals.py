@@ -35,7 +35,10 @@ _WARM_STEPS = 3
 class LinearEstimator:
     """Compute Eq. (1) to (3), linearised at images without effects.
 
-    frames: the nearly noise-free images without effects, with the exact positions of the occulter.
+    Parameters
+    ----------
+    frames
+        The nearly noise-free images without effects, with the exact positions of the occulter.
     """
 
     def __init__(self, frames: Sequence[Frame], diffraction: Kernel, law: ScatterTruth, noise: Noise) -> None:

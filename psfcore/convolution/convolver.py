@@ -33,9 +33,18 @@ Field = NDArray[np.floating]
 class Convolver:
     """Convolution with one PSF, cut to one field, and the adjoint of this operator.
 
-    psf_kernel: weights [y, x], centre at [ny // 2, nx // 2]. field_shape: (ny, nx) of the arrays to convolve.
-    dtype: float32 or float64, for transforms and results. threads: number of threads for the transforms.
     Raises DataError "field-shape" if an array has another shape.
+
+    Parameters
+    ----------
+    psf_kernel
+        Weights [y, x], centre at [ny // 2, nx // 2].
+    field_shape
+        Shape (ny, nx) of the arrays to convolve.
+    dtype
+        Type of the numbers in transforms and results: float32 or float64.
+    threads
+        Number of threads for the transforms.
     """
 
     def __init__(

@@ -74,12 +74,21 @@ class Lines(NamedTuple):
 class Engine:
     """Convolution with one PSF, cut to one field, and the adjoint of this operator, in float32.
 
-    psf_kernel: weights [y, x] of any shape, even or odd; centre at [ny // 2, nx // 2]. field_shape: (ny, nx).
-    span: (ny, nx); the convolution is exact for every pair of pixels that are closer to each other than this. Default:
-    the shape of the field, so that it is exact for all pairs. If the field includes a margin, a smaller span makes the
-    transforms shorter. Pixels farther apart then lie in opposite margins, and light may wrap from one to the other.
-    threads: number of threads; it does not change the result.
     Raises DataError "field-shape" if an array has another shape.
+
+    Parameters
+    ----------
+    psf_kernel
+        Weights [y, x] of any shape, even or odd; centre at [ny // 2, nx // 2].
+    field_shape
+        Shape (ny, nx) of the field.
+    span
+        Distances (ny, nx): the convolution is exact for every pair of pixels that are closer to each other than this.
+        Default: the shape of the field, so that the convolution is exact for all pairs. If the field includes a margin,
+        a smaller span makes the transforms shorter. Pixels farther apart then lie in opposite margins, and light may
+        wrap from one to the other.
+    threads
+        Number of threads; it does not change the result.
     """
 
     def __init__(

@@ -192,7 +192,12 @@ def _survey(mask: MaskGrid, pool: ThreadPoolExecutor) -> _Survey:
 class _Transforms:
     """Computes the sum of |E|^2 over samples, for any mask: a transform of Eq. (2) for each place.
 
-    offsets: the number of different offsets in x of all places. The result has the shape (size, size).
+    The result has the shape (size, size).
+
+    Parameters
+    ----------
+    offsets
+        The number of different offsets in x of all places.
     """
 
     def __init__(

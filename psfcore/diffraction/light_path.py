@@ -145,7 +145,12 @@ class LightPath:
 class Waves:
     """Waves from the aperture over both mirrors to a plane behind them, each computed from the wave before.
 
-    plane: the grid of the plane, at distance_mm from the secondary.
+    Parameters
+    ----------
+    plane
+        The grid of the plane.
+    distance_mm
+        The distance of the plane from the secondary.
     """
 
     def __init__(self, path: LightPath, plane: Grid, distance_mm: float) -> None:

@@ -203,8 +203,13 @@ def arm_profile(
 ) -> ArmProfile:
     """Profile along the arm that leaves the centre at `arm_deg`, degrees from +x towards +y.
 
-    Distances at which less than half of the strip is usable are left out. variance [y, x]: the variance of each pixel
-    of the difference. Raises DataError "flare-bad-centre", "flare-short-arm".
+    Distances at which less than half of the strip is usable are left out. Raises DataError "flare-bad-centre",
+    "flare-short-arm".
+
+    Parameters
+    ----------
+    variance
+        The variance [y, x] of each pixel of the difference.
     """
     ny, nx = difference.shape
     if not (0 <= centre_xy[0] < nx and 0 <= centre_xy[1] < ny):

@@ -41,8 +41,12 @@ def version_text(version: str, status: str, identity: str | None = None) -> str:
 
 
 def title(name: str, version: str, status: str | None) -> str:
-    """A PSF with its version and status, such as "PSF aia_171 1.0.0 (certified)". status None: it does not exist
-    yet, or a status that changes must not be told.
+    """A PSF with its version and status, such as "PSF aia_171 1.0.0 (certified)".
+
+    Parameters
+    ----------
+    status
+        The status; None if the PSF does not exist yet, or if a status that changes must not be told.
     """
     return " ".join(filter(None, ("PSF", name, version, status and f"({status})")))
 

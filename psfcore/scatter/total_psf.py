@@ -74,7 +74,13 @@ class TotalPsf:
     """Computes total PSFs that share one diffraction PSF.
 
     The total PSFs lie on a square whose edge is twice the longer edge of the field, at most the edge of the full reach.
-    diffraction: weights [y, x], sum 1 on its own grid. field_shape: (ny, nx) of the images.
+
+    Parameters
+    ----------
+    diffraction
+        Weights [y, x] of the diffraction PSF, sum 1 on their own grid.
+    field_shape
+        Shape (ny, nx) of the images.
     """
 
     def __init__(
@@ -166,8 +172,12 @@ def possible_on_pixels(psf: Psf, header: Header, *, threads: int = 1) -> list[Ps
 class Blur:
     """Convolution with a kernel on one field, in float32; the result is cropped to the field.
 
-    kernel: [y, x], centre at [n // 2, n // 2]; its values may have any sign. The scene is assumed dark beyond the edges
-    of the field.
+    The scene is assumed dark beyond the edges of the field.
+
+    Parameters
+    ----------
+    kernel
+        Values [y, x] of any sign, centre at [n // 2, n // 2].
     """
 
     def __init__(self, kernel: Kernel, field_shape: tuple[int, int], *, threads: int = 1) -> None:

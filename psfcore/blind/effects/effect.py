@@ -162,7 +162,7 @@ def declare(
     ----------
     options
         Further fields of `EffectKind`.
-    draw
+    **draw
         The parameters of the effect, and how each is drawn.
     """
 
@@ -193,8 +193,8 @@ class Effect:
         return replace(self, strength=strength)
 
     def as_json(self) -> dict[str, object]:
-        """The effect for the truth of a case. cause: its name in the gap library; None if the library does not
-        contain it.
+        """The effect for the truth of a case. The entry `cause` is the name of the effect in the gap library; None if
+        the library does not contain the effect.
         """
         kind = self.kind
         return {

@@ -70,7 +70,7 @@ def rescaled(optics: FineOptics, falloff: Plane, before: Plane) -> FineOptics:
 def wide_halo(effect: Effect, optics: FineOptics, moment: Moment) -> FineOptics:
     """Particles or a second surface scatter a fraction of the light into an exponential or Moffat halo.
 
-    scale: the scale of the halo, in widths of the field.
+    The parameter `scale` is the scale of the halo, in widths of the field.
     """
     x, y = optics.offsets_px
     r, scale_px = np.hypot(x, y), effect["scale"] * moment.plan.size_px
@@ -191,8 +191,8 @@ def field_dependent_scatter(
 def ghost(effect: Effect, seen: Plane, moment: Moment) -> Plane:
     """Light is reflected between the filter and the detector.
 
-    It is a faint copy of the image that is displaced, out of focus, slightly rotated and slightly magnified. shift: the
-    distance of the copy, in widths of the field.
+    The ghost is a faint copy of the image that is displaced, out of focus, slightly rotated and slightly magnified. The
+    parameter `shift` is the distance of the copy, in widths of the field.
     """
     n, magnification = seen.shape[0], effect["magnification"]
     cos, sin = direction(effect["turn_deg"])

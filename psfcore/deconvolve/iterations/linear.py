@@ -96,8 +96,11 @@ class LinearIteration(Iteration):
 class Additive(LinearIteration):
     """The iteration of Eq. (1).
 
-    step_filter: G, divided by `engine.transfer_scale`, in the layout of `engine.transfer`. A constant G is
-    `np.full_like(engine.transfer[:, :, :1], G / engine.transfer_scale)`.
+    Parameters
+    ----------
+    step_filter
+        The filter G, divided by `engine.transfer_scale`, in the layout of `engine.transfer`. A constant G is
+        `np.full_like(engine.transfer[:, :, :1], G / engine.transfer_scale)`.
     """
 
     def __init__(self, problem: Problem, step_filter: NDArray[np.float32]) -> None:

@@ -193,7 +193,7 @@ class _Sums:
 class ClosedForm:
     """The evidence of causes for the data of a linear model.
 
-    Attributes
+    Parameters
     ----------
     columns
         The columns of the fields of the model.

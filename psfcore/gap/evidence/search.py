@@ -199,7 +199,12 @@ def distinguished(gains: Vector) -> float:
 class _Unabsorbed:
     """The component of residuals and responses that a change of the PSF cannot absorb, in units of the noise.
 
-    absorbed: the responses to the coordinates of the PSF (n, coordinates). residual: (n,).
+    Parameters
+    ----------
+    absorbed
+        The responses to the coordinates of the PSF (n, coordinates).
+    residual
+        The residuals (n,).
     """
 
     def __init__(self, absorbed: Matrix, residual: Vector) -> None:
