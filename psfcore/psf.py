@@ -73,7 +73,7 @@ class Psf:
     components
         Kernels with the same centre ("DIFFRACTION", "SCATTER").
     provenance
-        Texts and numbers for JSON.
+        The origin of the PSF, as texts and numbers for JSON.
     fitted
         The fitted formula of SCATTER.
     turn_deg

@@ -284,7 +284,7 @@ class PsfSource:
     prepared
         The PSFs and engines that are kept between images.
     other_channel
-        See `check_channel`.
+        Whether the PSF may be of another channel than the image, see `check_channel`.
     seen_as
         Function that adds the instrument and the wavelength for the checks, if the file of the PSF does not name them.
     used
@@ -357,11 +357,11 @@ def read_and_deconvolve(
     shape
         Shape (ny, nx) of the image, if its header states it; then the job must fit into `free_bytes` of free memory.
     again
-        Deconvolve the image even if it is a product or a PSF.
+        Whether to deconvolve the image even if it is a product or a PSF.
     clip
         Function that changes the pixels after the warnings were found; the product contains the unchanged image.
     begin
-        See `deconvolve`.
+        Function that is called when a stage begins, see `deconvolve`.
     say
         Function of a code and a message that is called for each warning before the work begins.
     """

@@ -49,11 +49,11 @@ class Frame:
     scale_arcsec
         Plate scale along x and y, arcsec/px; None: unknown.
     on_detector
-        T of Eq. (2).
+        The matrix T of Eq. (2).
     roll_known
         Whether a card states the roll of the detector.
     interpolated
-        Why the pixels are not those of the detector; None: they are.
+        The reason why the pixels are not those of the detector; None: they are those of the detector.
     """
 
     scale_arcsec: tuple[float | None, float | None]

@@ -102,7 +102,7 @@ class Diagnosis:
     corrected
         The full refit with the told causes, if they are effects of the library and the refit succeeded.
     shapes
-        The shape of each alternative that is another form of its family, by the name of the family.
+        The shape of each alternative that is another form of its family; the key is the name of the family.
     residual, residual_after
         The residuals of held-out images without and with the told causes.
     cautions

@@ -204,14 +204,15 @@ class Mesh:
     pitch_um
         The distance from the centre of an opening to the centre of the next opening.
     angle_deg
-        The direction of this step; in a square mesh, the wires have this direction and the one across it.
+        The direction from the centre of an opening to the centre of the next opening; in a square mesh, the wires have
+        this direction and the direction across it.
     windows
         Number of windows of the diffraction series in each direction. At the entrance, this is the diameter of the
         aperture divided by the pitch; at the filter wheel, the number of windows that the light crosses.
     share
         The fraction of the light that crosses this mesh, if several meshes are mounted side by side.
     basis
-        "assumed" if any of these numbers is; each use of the PSF then says so.
+        "assumed" if any number of the mesh is assumed; each use of the PSF then says so.
     """
 
     name: Name
@@ -360,8 +361,8 @@ class Instrument:
     Attributes
     ----------
     turn_deg
-        The angle from the +x axis of the detector to that of the images, degrees. The angles and corners of a read
-        instrument are those on the images.
+        The angle from the +x axis of the detector to the +x axis of the images, degrees. The angles and corners of a
+        read instrument are those on the images.
     """
 
     name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,39}$")]

@@ -85,7 +85,7 @@ class Telescope:
     angstrom
         The wavelengths of the images that the entry describes; empty: all wavelengths.
     reason
-        Why there is no file.
+        The reason why there is no instrument file.
     ways
         Sentences about the steps with which a publication or a file helps; the recommended step comes first.
     """

@@ -94,8 +94,8 @@ class Choices:
     Attributes
     ----------
     weighed_by_observed
-        Each equation is divided by its own noisy intensity; the fitted light in faint discs is then too low. Corrected:
-        each equation is divided by the noise expected at the disc's mean.
+        Each equation is divided by the noisy intensity of its pixel; the fitted light in faint discs is then too low.
+        Corrected: each equation is divided by the noise expected at the mean of the disc.
     added
         The scatter kernel is added to the diffraction PSF, Eq. (1). Corrected: kernel and diffraction PSF are
         convolved, so the ring sums are computed from the diffracted scene.

@@ -114,20 +114,20 @@ def copy_files(
     Returns "kind", and "files" with the values of a ``Copied`` for each file. Files of folders beside the transit are
     checked too; their bytes in ``target`` mean nothing.
 
+    Raises DataError "not-an-archive", "archive-climbs", "archive-not-plain", "archive-too-large", "archive-broken". An
+    OSError of the disk is raised unchanged.
+
     Parameters
     ----------
     target
-        An open file.
+        The open file to which the bytes are written.
     path
-        The archive.
+        The file of the archive.
     limits
         The values of ``ArchiveLimits``.
     start_bytes
         How many bytes to copy of the start of each file, see `plain_start`; None: all bytes. Of transit.json,
         MAX_MANIFEST_BYTES and one more are copied.
-
-    Raises DataError "not-an-archive", "archive-climbs", "archive-not-plain", "archive-too-large", "archive-broken".
-    An OSError of the disk is raised unchanged.
     """
     gate = Gate(ArchiveLimits(**limits))
     found: list[tuple[Admitted, Copied]] = []

@@ -79,7 +79,7 @@ class FoundPlace:
     depth
         The missing light divided by the light that a disc would hide; 1 with an occulter, 0 without an occulter.
     depth_sigma
-        The error of depth.
+        The error of `depth`.
     within_reach
         Whether the position is near enough to the ephemeris.
     """

@@ -90,7 +90,7 @@ class EffectKind:
     Attributes
     ----------
     group
-        One of KNOWN, CALIBRATION, TEST.
+        The group: KNOWN, CALIBRATION or TEST.
     families
         The families of causes that are a right answer, the main one first.
     unit
@@ -104,15 +104,17 @@ class EffectKind:
     power
         The residual that the effect leaves is proportional to strength**power.
     varies
-        Whether its optics differ from image to image.
+        Whether the optics of the effect differ from image to image.
     noise_realisations
-        Number of noise realisations over which its change is averaged; 0 if the change does not depend on noise.
+        Number of noise realisations over which the change by the effect is averaged; 0 if the change does not depend on
+        noise.
     adds_light
-        Whether it adds light at places of the detector that stay the same; the truth then has a map of this light.
+        Whether the effect adds light at places of the detector that stay the same; the truth then has a map of this
+        light.
     form_of
         The effect of the gap library of which this withheld effect is another form.
     also
-        Effects of the library that it brings along, so that it is not wrong to name them.
+        Effects of the library that the effect brings along, so that it is not wrong to name them.
     saturation_dn
         The level in DN at which high-only images clip, from the effect, all exposures and the plan.
     """

@@ -60,7 +60,7 @@ def rescaled(optics: FineOptics, falloff: Plane, before: Plane) -> FineOptics:
     Parameters
     ----------
     before
-        The old falloff.
+        The old falloff, which `falloff` replaces.
     """
     amplitude = optics.law.a / FINE**2 * float(before.sum() / falloff.sum())
     return dataclasses.replace(optics, scatter=scaled_scatter(falloff, optics.law, amplitude))

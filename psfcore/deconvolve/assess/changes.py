@@ -58,11 +58,11 @@ class Structure:
     Attributes
     ----------
     kind
-        Bright or dark.
+        The kind of the blocks: bright or dark.
     sum_pct
-        Change of the summed light of these blocks.
+        Change of the summed light of these blocks, percent.
     median_pct
-        Median of their changes.
+        Median of the changes of these blocks, percent.
     up_to_pct
         Percentile 99 of the changes of bright blocks, or percentile 1 of the changes of dark blocks.
     before

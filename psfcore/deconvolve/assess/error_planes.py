@@ -106,7 +106,7 @@ def error_planes(
         The noise of the camera, the threads, and progress(done, of), which is called after each run; exceptions of
         `progress` are not caught.
     estimate
-        The result of run(image).
+        The deconvolved image, run(image).
     draws
         Number of noise realisations, 2 or more.
     edge_px

@@ -164,7 +164,7 @@ class Treated:
     changes
         The measured changes, as `Changes.as_json` gives them.
     before, after
-        Thumbnails [y, x].
+        Thumbnails [y, x] of the image before and after deconvolution.
     suspected
         Positions [y, x] of the thumbnail pixels with suspected artefacts, shape (n, 2).
     """

@@ -132,7 +132,7 @@ class DiscCells:
     jacobian
         The derivatives (columns, cells), DN/s for one unit of a parameter.
     pixels, radius, azimuth
-        As in `Cells`.
+        Size and place of each cell, as in `Cells`.
     boxes
         The sensitivities of the cells, and these times the expected image, each summed over boxes of the detector (2,
         cells, rows, columns).

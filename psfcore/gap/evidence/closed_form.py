@@ -72,7 +72,7 @@ class Form:
     family
         The name of the family in `tree.FAMILIES`, or the family of an added effect.
     effect
-        The name of the library for this form; None if it has none.
+        The name of the library for this form; None: the library has no name for it.
     columns
         The numbers of the columns of this form.
     likely

@@ -38,11 +38,11 @@ class EffectFit:
         Value, error and unit of each parameter; the key is "parameter", or "effect.parameter" if there are several
         effects.
     gain
-        The decrease of chi2.
+        The decrease of chi2 by the effects.
     p_value
         The p-value of the gain.
     step
-        The fit.
+        The fit of the columns of the effects.
     model
         The model that was fitted.
     """

@@ -183,15 +183,15 @@ class UnoccultedEquations:
     Attributes
     ----------
     normal
-        The normal matrix.
+        The normal matrix of the columns.
     score
-        The right-hand side.
+        The right-hand side of the equations.
     chi2
         The chi2 after the fit of scene and brightness alone, without the columns.
     freedom
-        Degrees of freedom of this chi2, if the brightness of every image is free.
+        Degrees of freedom of `chi2`, if the brightness of every image is free.
     independent
-        The same with the prior of the brightness, which leaves it less free.
+        Degrees of freedom of `chi2` with the prior of the brightness, which leaves the brightness less free.
     gains
         The fitted g_n of each image, without the columns.
     """

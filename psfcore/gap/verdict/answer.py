@@ -137,9 +137,9 @@ class Answer:
     Attributes
     ----------
     causes
-        The first cause, and those that act beside it; empty if no gap is detected.
+        The first cause, and the causes that act beside it; empty if no gap is detected.
     verdict, named
-        As in the table above.
+        Verdict and named causes, as in the table above.
     none
         The probability of no cause.
     hypotheses
@@ -149,7 +149,7 @@ class Answer:
     closed
         The closed form with the final noise.
     level
-        The probability of a group.
+        The probability that at least one label of the group of a cause acts.
     """
 
     causes: tuple[Cause, ...]

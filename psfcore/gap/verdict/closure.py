@@ -76,9 +76,9 @@ class HeldOut:
     residual_pct
         The mean of the disc, simulated minus observed, divided by the observed mean.
     noise_pct
-        The error of this residual, including the error of the fit.
+        The error of `residual_pct`, including the error of the fit.
     deviance
-        Eq. (4) of each fold; the key is the tuple of its held-out images.
+        The deviance, Eq. (4), of each fold; the key is the tuple of the held-out images of the fold.
     spread
         For each fold, the parts of chi2 that independent errors of its fit add on average, in the discs and in discs
         and blocks together.

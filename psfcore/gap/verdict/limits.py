@@ -53,9 +53,9 @@ class ParameterLimits:
     likely
         The largest plausible size of the parameter.
     found_90
-        None if no strength would be found.
+        The smallest strength that is found with a probability of 90 %; None if no strength would be found.
     excluded_95
-        None before there are data.
+        The 95 % quantile of the strength; None before there are data.
     """
 
     name: str
