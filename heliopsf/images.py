@@ -340,9 +340,14 @@ def _source_of(
 
 
 def _built_for(header: Header, progress: Steps | None, *, threads: int, parts: bool) -> Psf:
-    """The PSF of the shipped instrument file that the header names. parts: whether it needs its components.
+    """The PSF of the shipped instrument file that the header names.
 
     Raises ``DataError`` "no-psf-for-instrument".
+
+    Parameters
+    ----------
+    parts
+        Whether the PSF needs its components.
     """
     summary = seen_by(header)
     if summary["instrument"] is None:

@@ -61,8 +61,14 @@ _UNITS = {
 
 @dataclass(frozen=True)
 class _Parts:
-    """An image in memory. data: the pixels, which may not be computed yet. planes: as `psfcore.fits.unusable` has
-    them.
+    """An image in memory.
+
+    Attributes
+    ----------
+    data
+        The pixels, which may not be computed yet.
+    planes
+        Planes by name, as `psfcore.fits.unusable` names them.
     """
 
     data: Any
@@ -119,10 +125,15 @@ def _is_of(image: object, module: str, name: str) -> bool:
 
 
 def image_of(image: object, *, saturation: object, hdu: int | None = None) -> Image:
-    """The ``Image`` of psfcore for an image of the user. saturation: a number of DN, or a quantity.
+    """The ``Image`` of psfcore for an image of the user.
 
-    Pixels that the mask excludes are pixels without a value. Raises ``DataError`` "bad-input" for another
-    kind of object, "bad-unit" for a logarithmic unit, and the errors of reading an image.
+    Pixels that the mask excludes are pixels without a value. Raises ``DataError`` "bad-input" for another kind of
+    object, "bad-unit" for a logarithmic unit, and the errors of reading an image.
+
+    Parameters
+    ----------
+    saturation
+        The saturation level: a number of DN, or a quantity.
     """
     level = level_dn(saturation, {} if saturation is None else header_of(image, hdu))
     if isinstance(image, Image):
@@ -323,9 +334,13 @@ def _header(meta: Mapping[str, object] | Header) -> Header:
 def box_of(region: Region, image: object, hdu: int | None = None) -> Box:
     """The pixels of a region of an image.
 
-    region: a text "x0:x1,y0:y1"; two slices [y, x], such as ``np.s_[50:250, 100:400]``; or, for a Map, its bottom left
-    and top right corner as ``Map.submap`` takes them: coordinates, or quantities in pixels.
     Raises ``DataError`` "bad-region", "region-outside" or "region-too-small".
+
+    Parameters
+    ----------
+    region
+        The region: a text "x0:x1,y0:y1"; two slices [y, x], such as ``np.s_[50:250, 100:400]``; or, for a Map, its
+        bottom left and top right corner as ``Map.submap`` takes them: coordinates, or quantities in pixels.
     """
     shape = shape_of(image, hdu)
     if isinstance(region, str):

@@ -366,8 +366,14 @@ def built_psf(
     threads: int | None = None,
     progress: Steps | None = None,
 ) -> Psf:
-    """As ``build_psf``. turn_deg: for images of a known instrument that are turned by this angle against its detector.
-    parts: False: without the components, which a deconvolution does not need.
+    """The PSF of an instrument, as ``build_psf`` builds it.
+
+    Parameters
+    ----------
+    turn_deg
+        Angle by which the images are turned against the detector of a known instrument.
+    parts
+        Whether the PSF has its components, which a deconvolution does not need.
     """
     if not isinstance(instrument, str | Path):
         names = ", ".join(instrument_names())

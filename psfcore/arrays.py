@@ -64,10 +64,18 @@ def json_attributes(of: object, *names: str) -> dict[str, object]:
 class Comparison:
     """The differences between two arrays.
 
-    same: whether the arrays are equal bit for bit. largest_relative: the largest difference divided by the largest
-    absolute value of the first array; None if the shapes differ, if one array is finite where the other is
-    not, or if the finite values differ and those of the first array are all 0. values_that_differ: number of
-    differing values; None if the shapes differ. sha256: hashes of the two arrays, see ``array_sha256``.
+    Attributes
+    ----------
+    same
+        Whether the arrays are equal bit for bit.
+    largest_relative
+        The largest difference divided by the largest absolute value of the first array; None if the shapes differ, if
+        one array is finite where the other is not, or if the finite values differ and those of the first array are all
+        0.
+    values_that_differ
+        Number of differing values; None if the shapes differ.
+    sha256
+        Hashes of the two arrays, see ``array_sha256``.
     """
 
     same: bool
@@ -128,7 +136,12 @@ def scaled_inverse(normal: Matrix, *, weakest: float = WEAKEST_DIRECTION) -> Mat
     """Compute A^+ by Eq. (2) for a symmetric, non-negative matrix (n, n).
 
     The rows and columns of parameters that have no influence on the data are 0.
-    weakest: a direction is undetermined if its eigenvalue in B is at most this fraction of the largest eigenvalue.
+
+    Parameters
+    ----------
+    weakest
+        The limit for undetermined directions: a direction is undetermined if its eigenvalue in B is at most this
+        fraction of the largest eigenvalue.
     """
     size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     scale = np.outer(size, size)

@@ -122,7 +122,12 @@ def build_recipe(
 ) -> Psf:
     """Compute the PSF of a recipe. Its version and its provenance name the recipe.
 
-    parts: see `build_psf`. Raises the errors of `build_psf` and of `parse_instrument`.
+    Raises the errors of `build_psf` and of `parse_instrument`.
+
+    Parameters
+    ----------
+    parts
+        Whether to compute the components too, see `build_psf`.
     """
     instrument = parse_instrument(recipe.text, recipe.name or "instrument_file")
     psf = build_psf(

@@ -59,8 +59,13 @@ def compiled(
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Decorator: `numba.njit` with these options. The kernel releases the interpreter's lock and is kept on disk.
 
-    name: required for a function that uses constants of its enclosing function. Each set of constants needs another
-    name. Raises TypeError if the name is required and missing.
+    Raises TypeError if the name is required and missing.
+
+    Parameters
+    ----------
+    name
+        Name of the kernel, which a function needs that uses constants of its enclosing function. Each set of constants
+        needs another name.
     """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -105,8 +110,12 @@ def compiled_at_address(
 ) -> Callable[[Callable[..., None]], Addressed]:
     """Decorator for a kernel that is called by its address: `numba.cfunc` with this signature and these options.
 
-    The kernel is compiled when its address is asked for. name: see `compiled`; each kernel of a file needs another
-    name.
+    The kernel is compiled when its address is asked for.
+
+    Parameters
+    ----------
+    name
+        Name of the kernel, see `compiled`; each kernel of a file needs another name.
     """
 
     def decorate(function: Callable[..., None]) -> Addressed:

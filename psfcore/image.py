@@ -27,8 +27,14 @@ class MaskBit(IntFlag):
 class Saturation:
     """How the saturated pixels of an image were found, see `psfcore.fits.saturation`.
 
-    level: the saturation level in the unit of the image; None: unknown. found: the source of the level: a card,
-    "request", "instrument file" or "pixels". warning: a sentence for the user if pixels may be marked wrongly.
+    Attributes
+    ----------
+    level
+        The saturation level in the unit of the image; None: unknown.
+    found
+        The source of the level: a card, "request", "instrument file" or "pixels".
+    warning
+        A sentence for the user if pixels may be marked wrongly.
     """
 
     level: float | None
@@ -40,8 +46,14 @@ class Saturation:
 class Image:
     """Pixels [y, x] (float64, in `unit`), mask [y, x] (bits of MaskBit), header, and exposure time in seconds.
 
-    saturation: how the saturated pixels were found; None: this was not recorded. warnings: sentences about the image,
-    by their codes. Raises DataError: "not-2d", "too-small", "mask-shape", "unmasked-nonfinite".
+    Raises DataError: "not-2d", "too-small", "mask-shape", "unmasked-nonfinite".
+
+    Attributes
+    ----------
+    saturation
+        How the saturated pixels were found; None: this was not recorded.
+    warnings
+        Sentences about the image, by their codes.
     """
 
     pixels: NDArray[np.float64]

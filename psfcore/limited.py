@@ -168,8 +168,12 @@ def scratch_file() -> BinaryIO:
 
 
 def acting(path: str | Path) -> dict[str, bool]:
-    """Which parts of the wall stand around a child on this machine (`psfcore.wall.walls`). path: any file, which is not
-    read.
+    """Which parts of the wall stand around a child on this machine (`psfcore.wall.walls`).
+
+    Parameters
+    ----------
+    path
+        Any file, which is not read.
     """
     with Path(os.devnull).open("wb") as nowhere:
         return run_limited(_walls, path, nowhere, pixels=0)

@@ -40,8 +40,16 @@ LARGEST_OFFSET_PX = 0.05  # a PSF moves every image by the offset of its core
 class FittedShape:
     """The fitted formula of a scatter kernel, with its uncertainty.
 
-    shape: name of the formula in psfcore.scatter.shapes. parameters: names of its parameters. coordinates: values of
-    the unbounded coordinates in which the fit was done. covariance: covariance matrix of the coordinates.
+    Attributes
+    ----------
+    shape
+        Name of the formula in psfcore.scatter.shapes.
+    parameters
+        Names of the parameters of the formula.
+    coordinates
+        Values of the unbounded coordinates in which the fit was done.
+    covariance
+        Covariance matrix of the coordinates.
     """
 
     shape: str
@@ -54,12 +62,24 @@ class FittedShape:
 class Psf:
     """The weights [y, x] of a PSF, and how they were obtained.
 
-    kernel: a weight is the share of a point source's light that a pixel receives; the centre is [ny // 2, nx // 2].
-    components: kernels with the same centre ("DIFFRACTION", "SCATTER"). provenance: texts and numbers for JSON. fitted:
-    the fitted formula of SCATTER. turn_deg: the angle from the +x axis of the detector to that of the kernel. cards:
-    texts of the file's cards TELESCOP, INSTRUME, DETECTOR and FILTER, which say for which images the PSF is valid.
     Raises DataError: "psf-not-2d", "psf-too-small", "psf-nonfinite", "psf-negative", "psf-sum", "psf-not-centred",
     "psf-off-centre".
+
+    Attributes
+    ----------
+    kernel
+        The weights: each is the share of a point source's light that a pixel receives; the centre is [ny // 2, nx //
+        2].
+    components
+        Kernels with the same centre ("DIFFRACTION", "SCATTER").
+    provenance
+        The origin of the PSF, as texts and numbers for JSON.
+    fitted
+        The fitted formula of SCATTER.
+    turn_deg
+        The angle from the +x axis of the detector to the +x axis of the kernel.
+    cards
+        Texts of the file's cards TELESCOP, INSTRUME, DETECTOR and FILTER, which say for which images the PSF is valid.
     """
 
     kernel: Kernel

@@ -48,7 +48,13 @@ _ABANDONED_S = 86_400.0  # a temporary file of this age belongs to no running pr
 
 @dataclass(frozen=True)
 class CachedPsf:
-    """All files of one PSF. used_at: the time when the PSF was last used, in seconds since 1970."""
+    """All files of one PSF.
+
+    Attributes
+    ----------
+    used_at
+        The time when the PSF was last used, in seconds since 1970.
+    """
 
     identity: str
     files: tuple[Path, ...]
@@ -57,9 +63,14 @@ class CachedPsf:
 
 
 class PsfCache:
-    """Keeps the files of PSFs by identity. max_bytes: the largest size of all files; 0: nothing is kept.
+    """Keeps the files of PSFs by identity.
 
     Files in a folder that belongs to another user are not used, because that user could change them.
+
+    Parameters
+    ----------
+    max_bytes
+        The largest size of all files, bytes; 0: nothing is kept.
     """
 
     def __init__(self, folder: Path, max_bytes: int) -> None:
@@ -189,9 +200,15 @@ def built_file(
 ) -> Iterator[tuple[Path, dict[str, object]]]:
     """The file of the PSF of a recipe and its provenance: from the cache, or built and kept there.
 
-    parts: False: the PSF without its components, which is built in less time. If the components are asked for later,
-    the PSF is built again; its kernel is the same. progress is called while the PSF is built. If the cache cannot be
-    used, the PSF is built in every call, with a warning.
+    If the cache cannot be used, the PSF is built in every call, with a warning.
+
+    Parameters
+    ----------
+    parts
+        Whether the PSF has its components. Without them it is built in less time. If the components are asked for
+        later, the PSF is built again; its kernel is the same.
+    progress
+        Function that is called while the PSF is built.
     """
     identity = recipe.identity
     fits = cache.find(identity) or (None if parts else cache.find(identity, TOTAL_FITS))

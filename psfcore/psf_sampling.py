@@ -91,7 +91,13 @@ def psf_for_image(psf: Psf, header: Header) -> Psf:
 
 
 def turned(psf: Psf, turn: Matrix) -> Psf:
-    """The PSF of an image that was turned. turn: the matrix T of `psfcore.fits.frame`, with the values -1, 0 and 1."""
+    """The PSF of an image that was turned.
+
+    Parameters
+    ----------
+    turn
+        The matrix T of `psfcore.fits.frame`, with the values -1, 0 and 1.
+    """
     if turn == UNIT:
         return psf
     return replace(

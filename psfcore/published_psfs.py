@@ -94,10 +94,16 @@ def get(
 ) -> Path:
     """Bring a published PSF, if ``folder`` does not have it yet; returns its file.
 
-    source: a folder with the published file, for machines without internet; None: download it. A file of a folder is
-    compared with the SHA-256 of the table, if that has one. progress(stage, done, of), in MiB. Raises DataError
-    "unknown-published-psf", "no-address", "psf-not-downloaded", "no-such-file", "published-psf-changed", and the errors
-    of a file that is no PSF; MissingExtra without pooch.
+    Raises DataError "unknown-published-psf", "no-address", "psf-not-downloaded", "no-such-file",
+    "published-psf-changed", and the errors of a file that is no PSF; MissingExtra without pooch.
+
+    Parameters
+    ----------
+    source
+        A folder with the published file, for machines without internet; None: the file is downloaded. A file of a
+        folder is compared with the SHA-256 of the table, if the table has one.
+    progress
+        Function progress(stage, done, of) that is called during a download, with `done` and `of` in MiB.
     """
     one = published(name)
     kept = folder / f"{name}.fits"

@@ -65,7 +65,10 @@ def module_in_file(path: Path, prefix: str) -> ModuleType:
 def named_errors(source: str, bad: Bad) -> Iterator[None]:
     """Run user code; if it raises an error other than DataError, raise the error that `bad` makes.
 
-    source: the file or module of the code. The message names the line of the code.
+    Parameters
+    ----------
+    source
+        The file or module of the code. The message names the line of the code.
     """
     try:
         yield

@@ -104,10 +104,14 @@ class _Program(ctypes.Structure):
 
 
 def raise_wall(files: Sequence[str | Path]) -> None:
-    """Raise the wall around this process, as far as its kernel has the parts. files: those that it may still open to
-    read.
+    """Raise the wall around this process, as far as its kernel has the parts.
 
     Raises OSError if a part exists and cannot be raised, or a file cannot be opened.
+
+    Parameters
+    ----------
+    files
+        The files that the process may still open to read.
     """
     if sys.platform != "linux":
         return

@@ -145,9 +145,13 @@ def make_set(
     """Make and seal the missing cases of a set. Two results: the set, and for each case that could not be made, the
     reason.
 
-    scenes: images [y, x] in DN/s, from which scenes are cut. Raises DataError "other-set" if the folder contains a
-    set that was made with another plan or other scenes, "bad-seals", and the errors of `draw_case`: all before the
-    first case is made.
+    Raises DataError "other-set" if the folder contains a set that was made with another plan or other scenes,
+    "bad-seals", and the errors of `draw_case`: all before the first case is made.
+
+    Parameters
+    ----------
+    scenes
+        Images [y, x] in DN/s, from which scenes are cut.
     """
     blind_set = BlindSet(folder)
     _remember(blind_set, plan, scenes)

@@ -180,7 +180,13 @@ def _content(of: SetPlan, number: int) -> tuple[str, list[tuple[str, Range]]]:
 
 
 def _pair(seed: int, count: int) -> list[tuple[str, Range]]:
-    """The two effects of a pair, as in the result of `_content`. count: the number of pairs in the earlier cases."""
+    """The two effects of a pair, as in the result of `_content`.
+
+    Parameters
+    ----------
+    count
+        The number of pairs in the earlier cases.
+    """
     turn, place = divmod(count, 3)
     if place == 1:
         return [(_in_turn(seed, turn, _BESIDE_SUN, 2), STRONG_PCT), (_SUN, SUN_RMS)]
@@ -230,7 +236,12 @@ def case_scenes(case: Case, images: Sequence[Plane] = ()) -> dict[int, Plane]:
     """Fine scenes [y, x], DN/s, by pointing: cut from images, or synthetic with random statistics if there are no
     images.
 
-    images: [y, x] in DN/s, used in turn. A single image is mirrored for the west limb. Raises DataError "bad-scene".
+    Raises DataError "bad-scene".
+
+    Parameters
+    ----------
+    images
+        Images [y, x] in DN/s, used in turn. A single image is mirrored for the west limb.
     """
     scenes = {}
     for pointing in case.plan.pointings:

@@ -74,7 +74,12 @@ COMPARABLE = {
 class Cause:
     """A true cause of a case.
 
-    effect: its entry in the truth. bound: its entry in bound.json; None if the bound was not computed.
+    Attributes
+    ----------
+    effect
+        The entry of the effect in the truth.
+    bound
+        The entry of the effect in bound.json; None if the bound was not computed.
     """
 
     case: DiagnosedCase

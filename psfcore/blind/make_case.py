@@ -36,10 +36,17 @@ def make(case: Case, transit: Path, expected: Path, images: Sequence[Plane] = ()
     """Make the scenes, set the strengths, simulate the exposures, and measure what the effects leave. Returns the
     truth.
 
-    transit: a new folder for the transit; its files name no effect. expected: a new folder. If the case has effects, it
-    gets transits without noise: WITHOUT_EFFECTS, and one with each effect alone; CAUSES_FILE (gap-causes/1) lists them.
-    images: [y, x] in DN/s; scenes are cut from them. Empty: synthetic scenes. Raises DataError "bad-scene", and the
-    errors of `psfcore.scatter.inversion.invert`.
+    Raises DataError "bad-scene", and the errors of `psfcore.scatter.inversion.invert`.
+
+    Parameters
+    ----------
+    transit
+        A new folder for the transit; its files name no effect.
+    expected
+        A new folder. If the case has effects, the folder gets transits without noise: WITHOUT_EFFECTS, and one with
+        each effect alone; CAUSES_FILE (gap-causes/1) lists them.
+    images
+        Images [y, x] in DN/s, from which scenes are cut. Empty: the scenes are synthetic.
     """
     plan, diffraction = case.plan, binned_glass(case.glass)
     effect_free = EffectFree(plan, fine_optics(case.law, case.glass, plan.size_px), case_scenes(case, images))
@@ -94,7 +101,13 @@ def make(case: Case, transit: Path, expected: Path, images: Sequence[Plane] = ()
 
 
 def _effect(simulation: Simulation, left_pct: float, clean: Simulation) -> dict[str, object]:
-    """The entry of an effect in the truth. simulation: the case with this effect alone."""
+    """The entry of an effect in the truth.
+
+    Parameters
+    ----------
+    simulation
+        The case with this effect alone.
+    """
     (effect,) = simulation.effects
     entry = effect.as_json() | {"left_alone_pct": left_pct}
     if effect.kind.adds_light:

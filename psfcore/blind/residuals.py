@@ -35,7 +35,10 @@ _WARM_STEPS = 3
 class LinearEstimator:
     """Compute Eq. (1) to (3), linearised at images without effects.
 
-    frames: the nearly noise-free images without effects, with the exact positions of the occulter.
+    Parameters
+    ----------
+    frames
+        The nearly noise-free images without effects, with the exact positions of the occulter.
     """
 
     def __init__(self, frames: Sequence[Frame], diffraction: Kernel, law: ScatterTruth, noise: Noise) -> None:
@@ -56,7 +59,13 @@ class LinearEstimator:
         self._observed = [float(clean.observed(n).mean()) for n in images]
 
     def left_pct(self, images: Sequence[Plane]) -> float:
-        """Eq. (2) after the refit, percent. images: all images with the effect [y, x], DN/s."""
+        """Eq. (2) after the refit, percent.
+
+        Parameters
+        ----------
+        images
+            All images with the effect [y, x], DN/s.
+        """
         clean = self._clean
         frames = (
             replace(frame, pixels=pixels) for frame, pixels in zip(clean.transit.frames, images, strict=True)

@@ -36,8 +36,12 @@ _LAST_WORDS = 2000
 
 @dataclass(frozen=True)
 class Run:
-    """One run of a program: its wall time, its largest memory and its exit status. error: the reason if it gave no
-    result.
+    """One run of a program: its wall time, its largest memory and its exit status.
+
+    Attributes
+    ----------
+    error
+        The reason why the program gave no result; empty: the program gave one.
     """
 
     case: int
@@ -117,7 +121,13 @@ def run_of(blind_set: BlindSet, number: int) -> Run | None:
 
 
 def result_in(file: Path, schema: str) -> dict[str, object] | None:
-    """The complete result of this schema in a file; None if there is none. schema: REPORT_SCHEMA or BOUND_SCHEMA."""
+    """The complete result of this schema in a file; None if there is none.
+
+    Parameters
+    ----------
+    schema
+        The schema: REPORT_SCHEMA or BOUND_SCHEMA.
+    """
     try:
         found = json.loads(file.read_text("utf-8"))
     except (OSError, ValueError):

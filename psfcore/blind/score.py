@@ -41,7 +41,13 @@ Z95 = 1.959963984540054
 
 
 class Row(TypedDict):
-    """A row of the table; None for what the cases do not give. wilson95: the ends of the interval of the value."""
+    """A row of the table; None for what the cases do not give.
+
+    Attributes
+    ----------
+    wilson95
+        The ends of the interval of the value.
+    """
 
     figure: str
     n: int
@@ -179,7 +185,10 @@ def _over_bound(figure: str, causes: Sequence[Cause], level: str, least: float) 
 def score(cases: Sequence[DiagnosedCase], failures: Mapping[int, str]) -> Score:
     """The score of the cases that have a report, as JSON (gap-blind/3).
 
-    failures: the reasons why the other cases have no report, by number.
+    Parameters
+    ----------
+    failures
+        The reasons why the other cases have no report, by number.
     """
     return {
         "schema": SCHEMA,
@@ -209,7 +218,14 @@ def table(found: Score) -> str:
 def write_score(blind_set: BlindSet, numbers: Sequence[int], not_made: Mapping[int, str]) -> str:
     """Open the seals of a diagnosed set, judge its cases, and write score.json and score.txt into its folder.
 
-    numbers: the cases to score. not_made: the reason for each case that could not be made. Returns the table as text.
+    Returns the table as text.
+
+    Parameters
+    ----------
+    numbers
+        The cases to score.
+    not_made
+        The reason for each case that could not be made.
     """
     cases, failures = diagnosed_cases(blind_set, numbers)
     found = score(cases, dict(not_made) | failures)

@@ -31,7 +31,10 @@ _REALISATIONS_STREAM, _NOISE_STREAM = 2001, 2002
 class EffectFree:
     """A plan, its telescope and its scenes without any effect.
 
-    scenes: fine scenes [y, x], DN/s, by pointing. Along each axis, FINE fine pixels cover one detector pixel.
+    Attributes
+    ----------
+    scenes
+        Fine scenes [y, x], DN/s, by pointing. Along each axis, FINE fine pixels cover one detector pixel.
     """
 
     plan: Plan
@@ -49,8 +52,13 @@ class EffectFree:
 class Simulation:
     """The simulation of the images of a plan with a set of effects. Each result is computed once and kept.
 
-    seed: the seed of the noise. headroom: the level at which high-only images clip, divided by the brightest pixel,
-    if no effect sets this level; None: no clipping.
+    Parameters
+    ----------
+    seed
+        The seed of the noise.
+    headroom
+        The level at which high-only images clip, divided by the brightest pixel, if no effect sets this level; None: no
+        clipping.
     """
 
     def __init__(

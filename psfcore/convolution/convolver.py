@@ -33,9 +33,18 @@ Field = NDArray[np.floating]
 class Convolver:
     """Convolution with one PSF, cut to one field, and the adjoint of this operator.
 
-    psf_kernel: weights [y, x], centre at [ny // 2, nx // 2]. field_shape: (ny, nx) of the arrays to convolve.
-    dtype: float32 or float64, for transforms and results. threads: number of threads for the transforms.
     Raises DataError "field-shape" if an array has another shape.
+
+    Parameters
+    ----------
+    psf_kernel
+        Weights [y, x], centre at [ny // 2, nx // 2].
+    field_shape
+        Shape (ny, nx) of the arrays to convolve.
+    dtype
+        Type of the numbers in transforms and results: float32 or float64.
+    threads
+        Number of threads for the transforms.
     """
 
     def __init__(
@@ -131,9 +140,15 @@ def correlations(
 ) -> NDArray[np.floating]:
     """Correlate planes with a scene: for each displacement d, sum plane(x) scene(x - d) over all pixels x.
 
-    planes: shape (k, ny, nx). scene: shape (ny + 2 reach_px, nx + 2 reach_px); its inner (ny, nx) pixels are the pixels
-    of the planes. d runs from -reach_px to reach_px along each axis. The result has the shape
-    (k, 2 reach_px + 1, 2 reach_px + 1); d = 0 is in the middle.
+    d runs from -reach_px to reach_px along each axis. The result has the shape (k, 2 reach_px + 1, 2 reach_px + 1); d =
+    0 is in the middle.
+
+    Parameters
+    ----------
+    planes
+        The planes (k, ny, nx).
+    scene
+        The scene (ny + 2 reach_px, nx + 2 reach_px); its inner (ny, nx) pixels are the pixels of the planes.
     """
     length = tuple(int(scipy.fft.next_fast_len(n, real=True)) for n in scene.shape)
     wide = scipy.fft.rfft2(planes, s=length)

@@ -74,12 +74,21 @@ class Lines(NamedTuple):
 class Engine:
     """Convolution with one PSF, cut to one field, and the adjoint of this operator, in float32.
 
-    psf_kernel: weights [y, x] of any shape, even or odd; centre at [ny // 2, nx // 2]. field_shape: (ny, nx).
-    span: (ny, nx); the convolution is exact for every pair of pixels that are closer to each other than this. Default:
-    the shape of the field, so that it is exact for all pairs. If the field includes a margin, a smaller span makes the
-    transforms shorter. Pixels farther apart then lie in opposite margins, and light may wrap from one to the other.
-    threads: number of threads; it does not change the result.
     Raises DataError "field-shape" if an array has another shape.
+
+    Parameters
+    ----------
+    psf_kernel
+        Weights [y, x] of any shape, even or odd; centre at [ny // 2, nx // 2].
+    field_shape
+        Shape (ny, nx) of the field.
+    span
+        Distances (ny, nx): the convolution is exact for every pair of pixels that are closer to each other than this.
+        Default: the shape of the field, so that the convolution is exact for all pairs. If the field includes a margin,
+        a smaller span makes the transforms shorter. Pixels farther apart then lie in opposite margins, and light may
+        wrap from one to the other.
+    threads
+        Number of threads; it does not change the result.
     """
 
     def __init__(
@@ -205,15 +214,24 @@ class Engine:
         self.row_stage(_rows_inverse, lanes)
 
     def columns(self, *, adjoint: bool) -> None:
-        """Transform the columns, multiply by the transfer function, and transform back. adjoint: multiply by its
-        conjugate.
+        """Transform the columns, multiply by the transfer function, and transform back.
+
+        Parameters
+        ----------
+        adjoint
+            Whether to multiply by the conjugate of the transfer function.
         """
         self.multiply_columns(self.transfer, conjugate=adjoint)
 
     def multiply_columns(self, transfer: Single, *, conjugate: bool = False) -> None:
-        """As ``columns``, but with a given filter. transfer: the filter, in the same layout as the transfer function.
+        """As ``columns``, but with a given filter.
 
-        conjugate: multiply by the complex conjugate of the filter.
+        Parameters
+        ----------
+        transfer
+            The filter, in the same layout as the transfer function.
+        conjugate
+            Whether to multiply by the complex conjugate of the filter.
         """
         self._stage(_columns, self.column_plan, self.column_blocks, transfer, conjugate)
 
@@ -404,7 +422,13 @@ def _clear(buffer: Single, filled: int, length: int) -> None:
 
 @compiled()
 def _rows_forward(lines: Lines, start: int, stop: int, lanes: Single, first_block: int) -> None:
-    """Transform the rows of blocks. first_block: the block of the spectrum to which block 0 of `lanes` belongs."""
+    """Transform the rows of blocks.
+
+    Parameters
+    ----------
+    first_block
+        The block of the spectrum to which block 0 of `lanes` belongs.
+    """
     nx = lanes.shape[1]
     for block in range(start, stop):
         _copy(lanes[block].reshape(-1), lines.buffer, nx * _SIZE)

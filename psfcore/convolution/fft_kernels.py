@@ -131,7 +131,13 @@ Leg = tuple[Vector, Vector]
 
 
 def _times(a: Leg, w: Leg, first: int = 0) -> Leg:
-    """The product of two complex numbers. first: the product in the imaginary part that is rounded with the sum."""
+    """The product of two complex numbers.
+
+    Parameters
+    ----------
+    first
+        The product in the imaginary part that is rounded together with the sum: 0 for ar * wi, 1 for ai * wr.
+    """
     (ar, ai), (wr, wi) = a, w
     real = ar.times_plus(wr, -(ai * wi))
     return real, ai.times_plus(wr, ar * wi) if first else ar.times_plus(wi, ai * wr)
@@ -218,7 +224,13 @@ def _butterfly(
 
 
 def _make_pass(radix: int, backward: int) -> Addressed:
-    """Make the pass of a radix, for blocks of any length. backward: 1: for `inverse`; 0: for `forward`."""
+    """Make the pass of a radix, for blocks of any length.
+
+    Parameters
+    ----------
+    backward
+        The direction: 1 for `inverse`, 0 for `forward`.
+    """
     factors = 2 * (radix - 1)
 
     @compiled_at_address(_PASS, name=f"{'backward' if backward else 'forward'}_{radix}")

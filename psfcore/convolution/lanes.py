@@ -76,7 +76,7 @@ class Vector:
 
 
 class Memory:
-    """The vectors in an array. data: pointer to its first number."""
+    """The vectors in an array; `data` is the pointer to the first number of the array."""
 
     def __init__(self, builder: ir.IRBuilder, data: ir.Value) -> None:
         self.builder, self.data = builder, data

@@ -65,7 +65,12 @@ Plane = NDArray[np.floating]
 class CameraNoise(Noise):
     """The noise of a camera, and where its figures come from.
 
-    basis: a text with the source. sigma: standard errors of photon gain and read noise (DN), if they were measured.
+    Attributes
+    ----------
+    basis
+        A text with the source.
+    sigma
+        Standard errors of photon gain and read noise (DN), if they were measured.
     """
 
     source: Literal["given", "published", "measured", "uncertainty"]
@@ -86,10 +91,14 @@ class CameraNoise(Noise):
 
 
 def camera_noise(image: Image, given: Noise | None, *, binning: int) -> CameraNoise:
-    """The noise of an image: the given one, or else the published one, or else the measured one.
+    """The noise of an image: the given noise, or else the published noise, or else the measured noise.
 
-    binning: an image pixel is the mean of binning x binning pixels of the camera. Raises DataError "no-noise-figures"
-    if none is known and the pixels show none, and "no-exposure".
+    Raises DataError "no-noise-figures" if no noise is known and the pixels show none, and "no-exposure".
+
+    Parameters
+    ----------
+    binning
+        Binning of the image: one of its pixels is the mean of binning x binning pixels of the camera.
     """
     if isinstance(given, CameraNoise):
         return given
@@ -111,9 +120,14 @@ def camera_noise(image: Image, given: Noise | None, *, binning: int) -> CameraNo
 
 
 def measured_noise(image: Image, sigma: Plane | None = None) -> CameraNoise:
-    """The noise that the pixels show, Eq. (1). sigma: standard deviation [y, x] of each pixel, if it is known.
+    """The noise that the pixels show, Eq. (1).
 
     Raises DataError "no-noise-figures", and "no-exposure" for a rate without an exposure time.
+
+    Parameters
+    ----------
+    sigma
+        Standard deviation [y, x] of each pixel, if it is known.
     """
     dn = dn_per_unit(image)
     # Blocks of rows from all parts of a large image are enough.

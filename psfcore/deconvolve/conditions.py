@@ -73,12 +73,12 @@ class OfBox:
     box
         The box in the pixels of the whole image.
     rim_px
-        Largest width of the rim around it.
+        Largest width of the rim around the box.
     error
         Bound of the difference from the deconvolution of the whole image, in the unit of the image; 0: there is no
         difference.
     mean
-        Of the valid pixels of the box in the image, in its unit.
+        Mean of the valid pixels of the box in the image, in the unit of the image.
     """
 
     box: Box

@@ -23,7 +23,13 @@ MOST_STEPS = 1000  # far beyond the point from which steps fit the noise
 
 @dataclass(frozen=True)
 class Parameter:
-    """A number that a method takes, from ``least`` to ``most``. about: what it means, for a description."""
+    """A number that a method takes, from ``least`` to ``most``.
+
+    Attributes
+    ----------
+    about
+        The meaning of the number, for a description.
+    """
 
     name: str
     default: Value
@@ -63,19 +69,19 @@ class Method:
     """A method of deconvolution, except its iteration.
 
     `python -m benchmarks.growth memory` measures margin_of_psf, plane_bytes and transform_bytes for estimates. None:
-    not measured, and the largest figure of all methods counts.
+    these numbers were not measured, and the largest figure of all methods counts.
 
     Attributes
     ----------
     use
         A text: its first sentence says for which images the method is good, the others what users must know about it.
     algorithm_version
-        Raise it when the same parameters give another result.
+        Version of the algorithm, which must be raised when the same parameters give another result.
     edges
         The default assumption about the scene beyond the edges.
     margin_share
         Largest share of its light that a pixel at the edge may get from beyond the margin;
-        `psfcore.deconvolve.edges.margin_for` computes the default width of the margin from it.
+        `psfcore.deconvolve.edges.margin_for` computes the default width of the margin from this share.
     may_be_negative
         Whether results can be negative.
     keeps_flux

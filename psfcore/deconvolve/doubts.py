@@ -40,7 +40,12 @@ _BESIDE = ((0, 1), (0, -1), (1, 0), (-1, 0))
 def input_warnings(psf: Psf, image: Image, method: str | None, *, channel: str | None) -> dict[str, str]:
     """Warnings about the inputs: sentences by their codes, the most harmful first.
 
-    method: the method of the deconvolution; None: none was chosen yet. channel: the answer of `check_channel`.
+    Parameters
+    ----------
+    method
+        The method of the deconvolution; None: none was chosen yet.
+    channel
+        The answer of `check_channel`.
     """
     warnings = frame_warnings(psf, image.header)
     warnings |= {} if channel is None else {"channel": channel}
@@ -95,7 +100,10 @@ def _negative_warning(image: Image) -> dict[str, str]:
 def pixel_warnings(image: Image, psf_kernel: NDArray[np.float64]) -> dict[str, str]:
     """Warnings about the pixels of an image: sentences by their codes.
 
-    psf_kernel: weights [y, x] on the pixels of the image, centre at [ny // 2, nx // 2].
+    Parameters
+    ----------
+    psf_kernel
+        Weights [y, x] on the pixels of the image, centre at [ny // 2, nx // 2].
     """
     warnings = {}
     spikes = count_spikes(image, psf_kernel)

@@ -48,10 +48,19 @@ Trust = NDArray[np.bool_]
 class Domain:
     """The plane on which a method estimates the scene: the field and its margin.
 
-    pixels [y, x]: the image divided by `scale`, and 0 where it is not finite; the margin holds its mirror image.
-    trusted: pixels to which the estimate is fitted. finite: pixels whose values can start the estimate.
-    field: position of the field in the plane. scale: the largest absolute pixel value. After the division, float32 can
-    represent any image.
+    Attributes
+    ----------
+    pixels
+        The image [y, x] divided by `scale`, and 0 where it is not finite; the margin holds the mirror image of the
+        field.
+    trusted
+        Pixels to which the estimate is fitted.
+    finite
+        Pixels whose values can start the estimate.
+    field
+        Position of the field in the plane.
+    scale
+        The largest absolute pixel value. After the division by this value, float32 can represent any image.
     """
 
     pixels: Plane
@@ -86,8 +95,12 @@ class Domain:
         return ny + sought, nx + sought
 
     def cut(self, blocks: Iterable[tuple[int, Plane]]) -> NDArray[np.float64]:
-        """Cut the field out of a plane, in the image's unit. blocks: the number of the first row, and rows of the
-        plane.
+        """Cut the field out of a plane, in the image's unit.
+
+        Parameters
+        ----------
+        blocks
+            Pairs of the number of the first row and the rows of the plane that begin there.
         """
         rows, columns = self.field
         pixels = np.empty((rows.stop - rows.start, columns.stop - columns.start))
@@ -116,7 +129,12 @@ def share_from_beyond(psf: Psf) -> NDArray[np.float64]:
 def band_px(shares: NDArray[np.float64], fraction: float) -> int:
     """Width of the band along an edge in which more than `fraction` of a pixel's light comes from beyond the edge.
 
-    shares: b of Eq. (1). The width holds for a uniform scene.
+    The width holds for a uniform scene.
+
+    Parameters
+    ----------
+    shares
+        The shares b of Eq. (1).
     """
     return int(np.count_nonzero(shares > fraction))
 
@@ -131,8 +149,13 @@ def inside_band(shape: tuple[int, ...], band_px: int) -> Trust:
 def margin_for(shares: NDArray[np.float64], field_shape: tuple[int, int], *, share: float) -> int:
     """Width of the margin, px: a pixel at the edge gets at most `share` of its light from beyond the margin.
 
-    shares: b of Eq. (1). The width is rounded up to a multiple of 16 px, half a block of the engine. It is at most half
-    the width of the field.
+    The width is rounded up to a multiple of 16 px, half a block of the engine. It is at most half the width of the
+    field.
+
+    Parameters
+    ----------
+    shares
+        The shares b of Eq. (1).
     """
     half_block = BLOCK_ROWS // 2
     width = half_block * -(-band_px(shares, share) // half_block)

@@ -66,8 +66,13 @@ class Convolved:
 
 
 def cards(found: Convolved, psf: UsedPsf) -> Cards:
-    """The cards that say how the image was convolved. They differ from those of a product, so that the result can
-    be deconvolved as an image of the telescope. psf: as the cards name it.
+    """The cards that say how the image was convolved. They differ from those of a product, so that the result can be
+    deconvolved as an image of the telescope.
+
+    Parameters
+    ----------
+    psf
+        The PSF as the cards name it.
     """
     return {
         "CNVPSFID": (psf.id, ""),
@@ -102,7 +107,7 @@ def lines(found: Convolved, psf: UsedPsf) -> list[str]:
 
 
 def write(found: Convolved, path: Path, psf: UsedPsf) -> None:
-    """Write a FITS file. psf: as the cards name it."""
+    """Write a FITS file whose cards name the PSF as `psf` does."""
     image = replace(found.image, pixels=found.pixels)
     write_image(path, image, cards=cards(found, psf), history=history(found, psf))
 
@@ -110,9 +115,15 @@ def write(found: Convolved, path: Path, psf: UsedPsf) -> None:
 def convolve(image: Image, psf: Psf, *, edges: KnownScene = "zero", threads: int = 1) -> NDArray[np.float64]:
     """Convolve an image with a PSF: H x of Eq. (1) in `psfcore.convolution.convolver`. Returns the pixels [y, x].
 
-    psf: the PSF on the pixels of the image. edges: the scene beyond the image, "zero" or "symmetric" (its mirror
-    image, as far as light reaches). Pixels without a value send no light, and stay without one.
-    Raises DataError "bad-edges", "all-masked" and "no-signal".
+    Pixels without a value send no light, and stay without a value. Raises DataError "bad-edges", "all-masked" and
+    "no-signal".
+
+    Parameters
+    ----------
+    psf
+        The PSF on the pixels of the image.
+    edges
+        The scene beyond the image: "zero", or "symmetric" (the mirror image of the image, as far as light reaches).
     """
     if edges not in (known := get_args(KnownScene)):
         raise DataError(
@@ -138,9 +149,15 @@ def convolve_image(
 ) -> Convolved:
     """Convolve an image with the PSF of a source, which is brought onto the pixels of the image.
 
-    free_bytes: the free memory, into which the work must fit; None: not known. begin: see
-    `psfcore.deconvolve.run.deconvolve`. Raises DataError "too-much-memory" before the PSF is built,
-    "plate-scale-known", "plate-scale-mismatch", "channel-mismatch", and the errors of the source and of `convolve`.
+    Raises DataError "too-much-memory" before the PSF is built, "plate-scale-known", "plate-scale-mismatch",
+    "channel-mismatch", and the errors of the source and of `convolve`.
+
+    Parameters
+    ----------
+    free_bytes
+        The free memory, into which the work must fit, bytes; None: not known.
+    begin
+        Function that is called when a stage begins, see `psfcore.deconvolve.work.Work.errors`.
     """
     if free_bytes is not None:
         (ny, nx), (rows, columns) = image.pixels.shape, source.kernel_shape

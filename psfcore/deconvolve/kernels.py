@@ -32,8 +32,12 @@ SIZE_PX = 32
 def compiling_beside(method: str, shape: tuple[int, int]) -> Iterator[None]:
     """In the block, another process compiles the kernels of a method, if they are not kept on disk yet, but can be.
 
-    shape: (ny, nx) of the image. The block ends when the process has ended. If the process fails, this process compiles
-    the kernels later.
+    The block ends when the process has ended. If the process fails, this process compiles the kernels later.
+
+    Parameters
+    ----------
+    shape
+        Shape (ny, nx) of the image.
     """
     if is_kept(engine._rows_forward) or not folder_of_kernels()[1]:
         yield

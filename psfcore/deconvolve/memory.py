@@ -45,7 +45,12 @@ MIB = 2**20
 class Demand:
     """A deconvolution: the method, the shapes (ny, nx) of image and PSF, and the options that determine its memory.
 
-    edges, margin_px: None: the default of the method. draws: number of noise realisations.
+    Attributes
+    ----------
+    edges, margin_px
+        Edges and width of the margin; None: the default of the method.
+    draws
+        Number of noise realisations.
     """
 
     method: str
@@ -96,7 +101,13 @@ def deconvolution_bytes(demand: Demand) -> float:
 
 
 def product_bytes(demand: Demand, image_px: int) -> float:
-    """The memory of a deconvolution whose changes are measured, in bytes. image_px: pixels of the whole image."""
+    """The memory of a deconvolution whose changes are measured, in bytes.
+
+    Parameters
+    ----------
+    image_px
+        Number of pixels of the whole image.
+    """
     part_px = math.prod(demand.image)
     return deconvolution_bytes(demand) + ASSESSED_BYTES * part_px + READ_BYTES * (image_px - part_px)
 
@@ -126,7 +137,12 @@ def check_memory(
 ) -> None:
     """Raise DataError "too-much-memory" if the task on an image of this shape needs more than the free memory.
 
-    The system would end the process otherwise, without a message. advice: how the task needs less memory.
+    Without this error, the system would end the process without a message.
+
+    Parameters
+    ----------
+    advice
+        A way in which the task needs less memory, for the message.
     """
     if needed_bytes <= free_bytes:
         return

@@ -59,8 +59,12 @@ class Iteration:
     - `update` computes the next x from this input. If `last` is false, it leaves the transformed rows of the next x in
       the spectrum.
 
-    x: the estimate, a plane [y, x] or in the engine's layout. change: rms of the change in the last step, divided by
-    the rms of x.
+    Attributes
+    ----------
+    x
+        The estimate, a plane [y, x] or in the engine's layout.
+    change
+        Rms of the change in the last step, divided by the rms of x.
     """
 
     x: NDArray[np.float32]
@@ -71,7 +75,13 @@ class Iteration:
         raise NotImplementedError
 
     def update(self, *, last: bool) -> None:
-        """Compute the next estimate. last: True if `measure` is not called again."""
+        """Compute the next estimate.
+
+        Parameters
+        ----------
+        last
+            Whether this is the last step, so that `measure` is not called again.
+        """
         raise NotImplementedError
 
 
@@ -83,9 +93,18 @@ def relative_change(moved: float, total: float) -> float:
 class Judgement(NamedTuple):
     """The judged pixels of Eq. (1) and their variance, as one argument of the compiled kernels.
 
-    rows [block][half][lane]: 1 for a judged row, else 0. first, last: judged columns, from `first` to `last` - 1.
-    pixels: n. slope, ground: terms of the variance in the domain's scaled unit. sums: for each block of rows, the sum
-    of Eq. (1) without the factor 1/n.
+    Attributes
+    ----------
+    rows
+        The array [block][half][lane]: 1 for a judged row, else 0.
+    first, last
+        Judged columns, from `first` to `last` - 1.
+    pixels
+        The number n of judged pixels.
+    slope, ground
+        Terms of the variance in the domain's scaled unit.
+    sums
+        For each block of rows, the sum of Eq. (1) without the factor 1/n.
     """
 
     rows: NDArray[np.float32]

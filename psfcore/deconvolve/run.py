@@ -224,11 +224,19 @@ def deconvolve(
 ) -> Product:
     """Deconvolve an image, or the box of it that the options name.
 
-    psf: the PSF on the pixels of the image. warnings: those of `input_warnings`, and others about the inputs.
-    possible_psfs, begin: see `Work.errors`. check_plane: called with the shape (ny, nx) of box and rim, which is known
-    only after the image is read; it may raise.
-
     Raises DataError "no-noise-figures", "no-noise-model", and the errors of `box_work` and of the method.
+
+    Parameters
+    ----------
+    psf
+        The PSF on the pixels of the image.
+    warnings
+        The warnings of `input_warnings`, and others about the inputs.
+    possible_psfs, begin
+        Functions for the error planes and the progress, see `Work.errors`.
+    check_plane
+        Function that is called with the shape (ny, nx) of box and rim, which is known only after the image is read; it
+        may raise.
     """
     if options.noise is None and options.parameters.get("stop") == "discrepancy":
         raise no_noise_model()  # measured noise is too uncertain to end an iteration
@@ -276,7 +284,7 @@ class PsfSource:
     prepared
         The PSFs and engines that are kept between images.
     other_channel
-        See `check_channel`.
+        Whether the PSF may be of another channel than the image, see `check_channel`.
     seen_as
         Function that adds the instrument and the wavelength for the checks, if the file of the PSF does not name them.
     used
@@ -302,7 +310,12 @@ class PsfSource:
 
     def on_pixels_of(self, header: Header, load: Callable[[], Psf]) -> tuple[Psf, Psf, str | None]:
         """The PSF as it is read or built, the PSF on the pixels of an image with this header, and the answer of
-        `check_channel`. load: calls `load` of this source.
+        `check_channel`.
+
+        Parameters
+        ----------
+        load
+            Function that calls `load` of this source.
         """
         of_telescope = known_instrument(header), frame_of(header).turn_to_build_deg
         key = (of_telescope if self.key is None else self.key, self.plate_scale_arcsec)
@@ -344,11 +357,11 @@ def read_and_deconvolve(
     shape
         Shape (ny, nx) of the image, if its header states it; then the job must fit into `free_bytes` of free memory.
     again
-        Deconvolve the image even if it is a product or a PSF.
+        Whether to deconvolve the image even if it is a product or a PSF.
     clip
         Function that changes the pixels after the warnings were found; the product contains the unchanged image.
     begin
-        See `deconvolve`.
+        Function that is called when a stage begins, see `deconvolve`.
     say
         Function of a code and a message that is called for each warning before the work begins.
     """
@@ -400,7 +413,7 @@ def read_and_deconvolve(
 
 
 def write(product: Product, path: Path, psf: UsedPsf, ids: Identities) -> None:
-    """Write a product as a FITS file. psf: as the cards name it."""
+    """Write a product as a FITS file whose cards name the PSF as `psf` does."""
     own = described(
         product.image.header,
         filename=ids.filename,

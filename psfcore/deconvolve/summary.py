@@ -9,7 +9,7 @@ from psfcore.instruments.psf_statements import offer, title
 
 
 def summary_lines(details: Mapping[str, Any]) -> list[str]:
-    """The lines. details: `psfcore.deconvolve.run.Product.details`."""
+    """The lines that summarise a product, from its `psfcore.deconvolve.run.Product.details`."""
     psf, noise, region = details["psf"], details["noise"], details["region"]
     lines = [
         f"{details['image']}, {title(psf['name'], psf['version'], psf['status'])}",
@@ -29,8 +29,9 @@ def summary_lines(details: Mapping[str, Any]) -> list[str]:
 
 
 def region_error(error_pct: float | None) -> str:
-    """How far the result of a region may differ from that of the whole image. error_pct: in percent of the region's
-    mean; None: a product of an earlier version, whose header gives it in the unit of the image alone.
+    """How far the result of a region may differ from the result of the whole image. `error_pct` is in percent of the
+    mean of the region; it is None for a product of an earlier version, whose header gives the error in the unit of the
+    image alone.
     """
     if error_pct is None:
         return "differs from the same pixels of the whole image by at most the card DCNVBERR"
@@ -50,5 +51,5 @@ def steps_done(details: Mapping[str, object]) -> str:
 
 
 def percent(value: float | None, digits: int = 1) -> str:
-    """A relative change as text. value: in percent; None if the reference contains no light."""
+    """A relative change as text. `value` is in percent; None if the reference contains no light."""
     return "n/a (no light)" if value is None else f"{value:+.{digits}f} %"

@@ -128,7 +128,10 @@ class Work:
     The method runs for the image. If errors are requested, it runs again for each noise realisation and for each
     variant of the PSF within its errors.
 
-    psf: the PSF on the image's pixels.
+    Attributes
+    ----------
+    psf
+        The PSF on the image's pixels.
     """
 
     image: Image
@@ -138,7 +141,15 @@ class Work:
     def run(
         self, image: Image | None = None, psf: Psf | None = None, progress: Progress | None = None
     ) -> Deconvolved:
-        """Run the method. image: replaces `self.image`; it must have the same shape. psf: replaces `self.psf`."""
+        """Run the method. Either argument replaces the attribute of the same name.
+
+        Parameters
+        ----------
+        image
+            An image with the shape of `self.image`; None: `self.image`.
+        psf
+            A PSF on the pixels of the image; None: `self.psf`.
+        """
         options = replace(self.options, progress=progress)
         return method_named(options.method)(
             image or self.image, psf or self.psf, options, **options.parameters
@@ -153,9 +164,14 @@ class Work:
     ) -> ErrorPlanes:
         """The error planes. The options contain the number of noise realisations and the noise.
 
-        possible_psfs: function that returns variants of the PSF within its errors, on the image's pixels. It returns no
-        PSF if the errors are not known. begin(stage, steps) is called when a stage begins, and returns the progress
-        function of the stage.
+        Parameters
+        ----------
+        possible_psfs
+            Function that returns variants of the PSF within its errors, on the pixels of the image. It returns no PSF
+            if the errors are not known.
+        begin
+            Function begin(stage, steps) that is called when a stage begins, and returns the progress function of the
+            stage.
         """
         # Most deconvolutions compute no errors, and do not load SciPy.
         from psfcore.deconvolve.assess.error_planes import error_planes, spread_of_results
@@ -292,11 +308,16 @@ class BoxWork:
 def box_work(work: Work, box: Box) -> BoxWork:
     """Prepare the deconvolution of a box: choose the rim, and subtract the light from beyond the rim.
 
-    work: the deconvolution of the whole image. The rim is the narrowest one whose bound is at most the option
-    `region_error`, as a share of the mean light of the box, or the whole image if no rim is wide enough.
+    The rim is the narrowest one whose bound is at most the option `region_error`, as a share of the mean light of the
+    box, or the whole image if no rim is wide enough.
 
     Raises DataError "region-outside", "region-too-small", "bad-region-error", "region-discrepancy", "all-masked", and
     "plate-scale-mismatch".
+
+    Parameters
+    ----------
+    work
+        The deconvolution of the whole image.
     """
     image, options, method = work.image, work.options, properties_of(work.options.method)
     shape = (image.pixels.shape[0], image.pixels.shape[1])

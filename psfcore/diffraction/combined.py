@@ -113,8 +113,12 @@ def available_parts(instrument: Instrument) -> tuple[str, ...]:
 
 
 def needed_parts(names: Iterable[str], available: Iterable[str], *, meshes_in_mask: bool) -> set[str]:
-    """The components that must be computed to obtain those of these names. available: all components of the
-    instrument.
+    """The components that must be computed to obtain the components of these names.
+
+    Parameters
+    ----------
+    available
+        All components of the instrument.
     """
     needed, there = set(names), set(available)
     if DIFFRACTION in needed:
@@ -137,8 +141,14 @@ def diffraction_patterns(
 ) -> Patterns:
     """Compute the components of these names, shape (size, size), not normalised.
 
-    The patterns of the spectral lines are multiplied by the weights of the lines and added. mount_image: pixels [y, x]
-    of the mount's mask image, if the instrument has one. progress: called with (done, of).
+    The patterns of the spectral lines are multiplied by the weights of the lines and added.
+
+    Parameters
+    ----------
+    mount_image
+        Pixels [y, x] of the mount's mask image, if the instrument has one.
+    progress
+        Function that is called with (done, of).
     """
     route, available = route_of(instrument), available_parts(instrument)
     needed = needed_parts(names, available, meshes_in_mask=route.meshes_in_mask)

@@ -46,10 +46,14 @@ _COMPARED_PX = (50.0, 150.0)  # orders at these radii are compared with the scat
 class MeshDesign:
     """One mesh: its geometry, and its effect in percent of all transmitted light.
 
-    peak_visibility: the contrast (high - low) / (high + low) of the orders along the axis, for a flare of FLARE_PX px
-    per side. It is 1 if the orders are separate, and 0 if they merge.
-    peak_over_scatter: the light of an order in a pixel, divided by the diffuse scatter of the same flare in this pixel;
-    the largest value for the orders on the axis from 50 to 150 px. None if the instrument has no scatter.
+    Attributes
+    ----------
+    peak_visibility
+        The contrast (high - low) / (high + low) of the orders along the axis, for a flare of FLARE_PX px per side. It
+        is 1 if the orders are separate, and 0 if they merge.
+    peak_over_scatter
+        The light of an order in a pixel, divided by the diffuse scatter of the same flare in this pixel; the largest
+        value for the orders on the axis from 50 to 150 px. None if the instrument has no scatter.
     """
 
     pitch_um: float

@@ -71,8 +71,16 @@ Progress = Callable[[int, int], None]
 class FarField:
     """Share of the pupil's light in each pixel [y, x], centre at [n // 2, n // 2], and how it was computed.
 
-    open_area_mm2: the open area of the pupil. samples: S of Eq. (3). symmetry: "none", "mirror" or "mirror and
-    transpose". The pattern sums to less than 1: the remaining light is beyond the grid.
+    The pattern sums to less than 1: the remaining light is beyond the grid.
+
+    Attributes
+    ----------
+    open_area_mm2
+        The open area of the pupil.
+    samples
+        The number of samples, S of Eq. (3).
+    symmetry
+        The symmetry of the mask: "none", "mirror" or "mirror and transpose".
     """
 
     pattern: NDArray[np.float64]
@@ -102,8 +110,12 @@ def far_field(
 ) -> FarField:
     """The far field of a pupil, Eq. (2), with a pattern of shape (size, size).
 
-    period: n, at least `size`, both even or both odd; default: size. progress: called with (done, of) after each
-    transform.
+    Parameters
+    ----------
+    period
+        The period n, at least `size`, both even or both odd; default: size.
+    progress
+        Function that is called with (done, of) after each transform.
     """
     n = period or size
     optics = {
@@ -133,7 +145,13 @@ def far_field(
 
 @dataclass(frozen=True)
 class _Survey:
-    """Area and symmetry of the mask; mirror_x, mirror_y: whether the mask equals its mirror image in x, in y."""
+    """Area and symmetry of the mask.
+
+    Attributes
+    ----------
+    mirror_x, mirror_y
+        Whether the mask equals its mirror image in x, and in y.
+    """
 
     open_area_mm2: float
     symmetry: str
@@ -174,7 +192,12 @@ def _survey(mask: MaskGrid, pool: ThreadPoolExecutor) -> _Survey:
 class _Transforms:
     """Computes the sum of |E|^2 over samples, for any mask: a transform of Eq. (2) for each place.
 
-    offsets: the number of different offsets in x of all places. The result has the shape (size, size).
+    The result has the shape (size, size).
+
+    Parameters
+    ----------
+    offsets
+        The number of different offsets in x of all places.
     """
 
     def __init__(

@@ -85,9 +85,12 @@ def grid_for(
 ) -> Grid:
     """The grid of a plane. Its step is so small that the light reaches the full width of the next plane.
 
-    next_width_mm, distance_mm: width of the next plane and its distance.
-
     Raises DataError "too-many-samples" if the distance is too short.
+
+    Parameters
+    ----------
+    next_width_mm, distance_mm
+        Width of the next plane, and the distance to it.
     """
     step_mm = wavelength_mm * distance_mm / (SAMPLING_MARGIN * next_width_mm)  # Eq. (4), with the margin
     samples = math.ceil(width_mm / step_mm)
@@ -140,7 +143,10 @@ def mirror_transmission(mirror: Mirror, grid: Grid) -> Wave:
 def mesh_openings_mm(mesh: Mesh, phase: float, width_mm: float) -> Vector:
     """Windows of a mesh over at least `width_mm`, rows of (begin, end).
 
-    phase: shift of the mesh divided by the pitch. At 0 a window is centred on the axis; at 0.5 a wire is centred on it.
+    Parameters
+    ----------
+    phase
+        Shift of the mesh divided by the pitch. At 0 a window is centred on the axis; at 0.5 a wire is centred on it.
     """
     pitch_mm, wire_mm = mesh.pitch_um * MM_PER_UM, mesh.wire_um * MM_PER_UM
     reach = math.ceil(width_mm / pitch_mm / 2) + 1

@@ -69,7 +69,10 @@ Progress = Callable[[int, int], None]
 class Sampling:
     """The sampling of a plane: width X, step dx and count N = X / dx.
 
-    least_samples: the smallest allowed count, X1 X2 / (lambda z); None for the detector.
+    Attributes
+    ----------
+    least_samples
+        The smallest allowed count, X1 X2 / (lambda z); None for the detector.
     """
 
     plane: str
@@ -159,9 +162,17 @@ def fresnel_study(
 ) -> FresnelStudy:
     """Compare the methods with the filter wheel at each distance (mm) from the detector.
 
-    phases: number of positions of the filter-wheel mesh, equally spaced over its pitch. windows: number of windows of
-    the analytic series; default: the number in the instrument file. progress: called with (done, of). Raises DataError
-    "bad-instrument-file", "no-focus", "bad-distance", "bad-phases", "bad-windows" or "too-many-samples".
+    Raises DataError "bad-instrument-file", "no-focus", "bad-distance", "bad-phases", "bad-windows" or
+    "too-many-samples".
+
+    Parameters
+    ----------
+    phases
+        Number of positions of the filter-wheel mesh, equally spaced over its pitch.
+    windows
+        Number of windows of the analytic series; default: the number in the instrument file.
+    progress
+        Function that is called with (done, of).
     """
     path = light_path(instrument)
     windows = path.wheel_mesh.windows if windows is None else windows

@@ -119,7 +119,13 @@ class LightPath:
         )
 
     def secondary_grid(self, next_width_mm: float, distance_mm: float) -> Grid:
-        """The grid of the secondary. next_width_mm, distance_mm: width of the next plane and its distance."""
+        """The grid of the secondary.
+
+        Parameters
+        ----------
+        next_width_mm, distance_mm
+            Width of the next plane, and the distance to it.
+        """
         return self._grid("secondary", self.secondary.diameter_mm, next_width_mm, distance_mm)
 
     def wheel_grid(self, distance_mm: float) -> Grid:
@@ -139,7 +145,12 @@ class LightPath:
 class Waves:
     """Waves from the aperture over both mirrors to a plane behind them, each computed from the wave before.
 
-    plane: the grid of the plane, at distance_mm from the secondary.
+    Parameters
+    ----------
+    plane
+        The grid of the plane.
+    distance_mm
+        The distance of the plane from the secondary.
     """
 
     def __init__(self, path: LightPath, plane: Grid, distance_mm: float) -> None:
@@ -235,12 +246,18 @@ def _lacking(instrument: Instrument, key: str, expected: str, got: str) -> DataE
 class BestFocus:
     """The separation of best focus, and the quantities that follow from it.
 
-    printed_blur_px: width of the geometric image of a point at the printed separation.
-    beyond_central_pixel_*: share of the light outside the central pixel, at the printed separation and in focus. This
-    share is computed in one dimension, for the open aperture without meshes.
-    nominal_focal_length_mm: the focal length of the instrument file.
-    order_spacing_px: spacing of the orders of the entrance mesh, measured in the focused image. The distance from order
-    -`orders` to order +`orders` is divided by 2 x `orders`.
+    Attributes
+    ----------
+    printed_blur_px
+        Width of the geometric image of a point at the printed separation.
+    nominal_focal_length_mm
+        The focal length of the instrument file.
+    order_spacing_px
+        Spacing of the orders of the entrance mesh, measured in the focused image. The distance from order -`orders` to
+        order +`orders` is divided by 2 x `orders`.
+    beyond_central_pixel_printed, beyond_central_pixel_focused
+        Share of the light outside the central pixel, at the printed separation and in focus. This share is computed in
+        one dimension, for the open aperture without meshes.
     """
 
     printed_separation_mm: float
@@ -278,8 +295,14 @@ def paraxial_separation_mm(path: LightPath) -> float:
 def best_focus(waves: Waves, *, nominal_focal_length_mm: float) -> BestFocus:
     """Solve for the separation of best focus.
 
-    waves: those of `waves_to_detector`. nominal_focal_length_mm: the focal length of the instrument file, for
-    comparison. Raises DataError "no-focus" if there is no maximum within SEARCH_MM of the paraxial separation.
+    Raises DataError "no-focus" if there is no maximum within SEARCH_MM of the paraxial separation.
+
+    Parameters
+    ----------
+    waves
+        The waves that `waves_to_detector` gives.
+    nominal_focal_length_mm
+        The focal length of the instrument file, for comparison.
     """
     path = waves.path
     at_primary = waves.at_primary(path.aperture_mm)

@@ -85,7 +85,12 @@ def mesh_line(
 ) -> NDArray[np.float64]:
     """Integrate Eq. (1) over each of `size` pixels, centre at [size // 2].
 
-    spacing_px: see `order_spacing_px`. Returns shape (size,), normalised to sum 1.
+    Returns shape (size,), normalised to sum 1.
+
+    Parameters
+    ----------
+    spacing_px
+        Spacing of the orders, see `order_spacing_px`.
     """
     alpha = np.pi * (pitch_um - wire_um) / pitch_um / spacing_px
     edges_px = np.arange(size + 1, dtype=np.float64) - size // 2 - 0.5
@@ -232,7 +237,12 @@ def hexagonal_mesh_kernel(
 ) -> NDArray[np.float64]:
     """The pattern of a hexagonal mesh, shape (size, size), centre at [size // 2, size // 2].
 
-    angle_deg: the direction from an opening to the next. The weights are fractions of the light on the whole plane.
+    The weights are fractions of the light on the whole plane.
+
+    Parameters
+    ----------
+    angle_deg
+        The direction from an opening to the next opening.
     """
     kernel = np.zeros((size, size))
     turn = math.radians(angle_deg)
@@ -250,7 +260,15 @@ def _add_orders(
     cosine: float,
     sine: float,
 ) -> None:
-    """Add all orders of Eq. (7) to their pixels. reach_px: lambda z / d; open_share: w / d."""
+    """Add all orders of Eq. (7) to their pixels.
+
+    Parameters
+    ----------
+    reach_px
+        The distance lambda z / d of Eq. (7), px.
+    open_share
+        The ratio w / d of Eq. (7).
+    """
     size = kernel.shape[0]
     origin = size // 2 + 0.5  # pixel i extends from i to i + 1
     corner_px = (size // 2 + 1) * math.sqrt(2.0)

@@ -74,7 +74,12 @@ def can_transform(period: int) -> bool:
 class MirroredTransforms:
     """Computes the sum of |E|^2 over samples, for a mask that equals its mirror images in x and in y.
 
-    period: n, a length for which `can_transform` is true. The result has the shape (size, size).
+    The result has the shape (size, size).
+
+    Parameters
+    ----------
+    period
+        The period n, a length for which `can_transform` is true.
     """
 
     def __init__(
@@ -198,7 +203,10 @@ def _fill_lanes(strip, first, lanes):  # type: ignore[no-untyped-def]  # compile
 def _transform(lanes, cells, turn, buffer, plan):  # type: ignore[no-untyped-def]  # compiled
     """Compute the sum of Eq. (3) into `buffer`, from the `cells` first rows of `lanes`.
 
-    turn[i]: the factor of cell i in Eq. (2), for i < cells; 0 for the further cells that complete a round.
+    Parameters
+    ----------
+    turn
+        The factor of each cell in Eq. (2); 0 for the further cells after the first `cells`, which complete a round.
     """
     x, z, length = lanes.reshape(-1), buffer, plan.length
     half = length // 2

@@ -59,7 +59,12 @@ class Pupil:
     picture.
 
     An outline consists of one or more closed polygons with corners (x, y) in mm. A polygon may be a hole in another
-    one. meshes: with square openings, parallel to the axes.
+    one.
+
+    Attributes
+    ----------
+    meshes
+        Meshes with square openings that are parallel to the axes.
     """
 
     opening: Outline
@@ -82,9 +87,13 @@ def entrance_pupil(
 ) -> Pupil:
     """The pupil of an aperture, with its mount and its meshes if they are given.
 
-    mount_image: pixels [y, x] of the mount's mask image; row 0 is at the lowest y, and 0 is opaque.
     Raises DataError "bad-mount" if the hub or a ray is as wide as the aperture, if a ring crosses the rim, if a corner
     is far outside, or if the mask image is missing or cannot be used. The message names the key.
+
+    Parameters
+    ----------
+    mount_image
+        Pixels [y, x] of the mount's mask image; row 0 is at the lowest y, and 0 is opaque.
     """
     radius_mm = aperture.diameter_mm / 2
     opaque = [] if mount is None else _mount_outlines(mount, radius_mm)
@@ -275,8 +284,14 @@ def _cover(strip, area, ranges, first_row, line, edges, outline_of_edge, first_e
     """Write the open share of each cell into `strip`.
 
     The open share of a cell is the product of its open shares in the meshes, in the opening (outline 0) and in all
-    other outlines. area: zeros, two more than a row has cells; ranges: room for the ranges of cells that the edges of
-    an outline cross in a row.
+    other outlines.
+
+    Parameters
+    ----------
+    area
+        Array of zeros; it is two longer than a row of cells.
+    ranges
+        Array for the ranges of cells that the edges of an outline cross in a row.
     """
     rows, cells = strip.shape
     begins, ends = ranges[0], ranges[1]
@@ -320,10 +335,15 @@ def _insert(begins: NDArray[np.int64], ends: NDArray[np.int64], count: int, begi
 
 @compiled()
 def _apply(row, line, line_y, start, stop, inside, outline):  # type: ignore[no-untyped-def]  # compiled
-    """Apply one outline to the cells from `start` to `stop` - 1. inside: the share of their area inside the outline.
+    """Apply one outline to the cells from `start` to `stop` - 1.
 
     Outline 0, the opening, sets the open share of these cells. Every other outline is opaque and reduces the open
     share.
+
+    Parameters
+    ----------
+    inside
+        The share of the area of these cells that is inside the outline.
     """
     covered = np.float32(min(abs(inside), 1.0))
     if outline == 0:

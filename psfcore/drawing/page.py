@@ -35,10 +35,17 @@ _FIGURE = re.compile(r'(?<=src=")figure:(\d+)')
 
 @dataclass(frozen=True)
 class Page:
-    """A page. html: the whole page in one file.
+    """A page.
 
-    For other pages that show the same: texts: the title, the lead and the footer as text, and the sections as HTML, in
-    which ``figure:N`` is the address of the figure N. figures: PNG, in reading order, from N = 1.
+    Attributes
+    ----------
+    html
+        The whole page in one file.
+    figures
+        The figures as PNG, in reading order, from N = 1.
+    texts
+        The texts for other pages that show the same: the title, the lead and the footer as text, and the sections as
+        HTML, in which ``figure:N`` is the address of the figure N.
     """
 
     html: str

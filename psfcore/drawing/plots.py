@@ -72,7 +72,14 @@ class PointStyle(TypedDict):
 
 
 class Panel(NamedTuple):
-    """An image to draw. beyond: the ends of the colour bar, beyond which there are values: "max" or "both"."""
+    """An image to draw.
+
+    Attributes
+    ----------
+    beyond
+        The ends of the colour bar beyond which there are values, as `Figure.colorbar` names them (``extend``): "max" or
+        "both".
+    """
 
     title: str
     pixels: Plane
@@ -84,11 +91,16 @@ class Panel(NamedTuple):
 def write_png(
     figure: Figure, target: str | Path | IO[bytes], *, pil_kwargs: dict[str, int] | None = None
 ) -> None:
-    """Draw a figure and write it as PNG. pil_kwargs: options of Pillow's writer of PNG.
+    """Draw a figure and write it as PNG.
 
     Matplotlib reads a text between two dollar signs as a formula, and fails if it is not a formula. Titles and labels
     contain names from files, so they are drawn without this rule. Only the numbers at the axes are formulas, such as
     10^3.
+
+    Parameters
+    ----------
+    pil_kwargs
+        Options of Pillow's writer of PNG.
     """
     for text in _plain_texts(figure):
         text.set_parse_math(False)
@@ -137,7 +149,10 @@ def preview_png(before: Plane, after: Plane, path: str | Path, *, title: str, un
 def preview_figure(before: Plane, after: Plane, *, title: str, unit: str) -> Figure:
     """Draw three panels [y, x], first row at the bottom: before, after (same stretch), change in percent.
 
-    unit: unit of the pixels, see `psfcore.fits.units`.
+    Parameters
+    ----------
+    unit
+        Unit of the pixels, see `psfcore.fits.units`.
     """
     figure = Figure(figsize=(15.6, 5.55), dpi=100, facecolor="white")
     figure.text(0.045, 0.955, title, fontsize=13, color=INK, va="center", weight="bold")
@@ -164,7 +179,13 @@ def compared_panels(before: Plane, after: Plane, unit: str) -> list[Panel]:
 def draw_panels(
     figure: Figure, panels: Sequence[Panel], places: Sequence[AxesBounds], shape: tuple[int, ...]
 ) -> None:
-    """Draw panels, three in a row, each with a colour bar. shape: of the image in pixels, for the axes."""
+    """Draw panels, three in a row, each with a colour bar.
+
+    Parameters
+    ----------
+    shape
+        Shape of the image in pixels, for the axes.
+    """
     extent = (-0.5, shape[1] - 0.5, -0.5, shape[0] - 0.5)
     for index, (panel, place) in enumerate(zip(panels, places, strict=True)):
         axes = figure.add_axes(place)
@@ -302,7 +323,13 @@ def change_pct(before: Plane, after: Plane) -> NDArray[np.float64]:
 
 
 def colourbar(figure: Figure, axes: Axes, drawn: ScalarMappable, *, beyond: str) -> None:
-    """Draw the bar of colours of a map at the right of its axes. beyond: see `Figure.colorbar`, extend."""
+    """Draw the bar of colours of a map at the right of its axes.
+
+    Parameters
+    ----------
+    beyond
+        The ends of the bar beyond which there are values, as for ``extend`` of `Figure.colorbar`.
+    """
     box = axes.get_position()
     width = 0.0085
     bar_axes = figure.add_axes((box.x1 + 0.006, box.y0, width, box.height))
@@ -360,7 +387,7 @@ def marker_size(images: int) -> float:
 
 
 def by_pointing(pointings: Sequence[int]) -> list[tuple[int, NDArray[np.bool_], str]]:
-    """Each pointing with a mask of its images and its colour. pointings: the pointing of each image."""
+    """Each pointing with a mask of its images and its colour; `pointings` holds the pointing of each image."""
     of_images = np.array(pointings)
     return [
         (one, of_images == one, POINTINGS[n % len(POINTINGS)]) for n, one in enumerate(sorted(set(pointings)))
@@ -372,7 +399,14 @@ def draw_errors(
 ) -> None:
     """Draw the errors of images, with their noise if it is known. Values of nan are not drawn.
 
-    The colour shows the pointing. pointings, where: pointing and abscissa of each image.
+    The colour shows the pointing.
+
+    Parameters
+    ----------
+    pointings
+        Pointing of each image.
+    where
+        Abscissa of each image.
     """
     axes.axhline(0, color="#555555", linewidth=1.0)
     for pointing, here, colour in by_pointing(pointings):
@@ -396,7 +430,13 @@ def draw_errors(
 def draw_band(
     axes: Axes, x: Vector, limits: NDArray[np.float64], colour: str, name: str, *, marker: str = ""
 ) -> None:
-    """Draw a median and its bands of 1 and 2 sigma. limits: the rows -2 sigma, -1 sigma, median, +1 sigma, +2 sigma."""
+    """Draw a median and its bands of 1 and 2 sigma.
+
+    Parameters
+    ----------
+    limits
+        The values at -2 sigma, -1 sigma, the median, +1 sigma and +2 sigma, one row each.
+    """
     low_2, low_1, median, high_1, high_2 = limits
     axes.fill_between(x, low_2, high_2, color=colour, alpha=0.18, linewidth=0)
     axes.fill_between(x, low_1, high_1, color=colour, alpha=0.32, linewidth=0)
@@ -408,8 +448,12 @@ def draw_weights_of_shells(
 ) -> None:
     """Draw the weights of the free shells that begin within the field as steps: medians, bands of 1 and 2 sigma.
 
-    No pixel constrains the other shells. limits: as for `draw_band`, one column for each shell. The axis is
-    logarithmic, so weights of 0 are drawn as very small ones.
+    No pixel constrains the other shells. The axis is logarithmic, so weights of 0 are drawn as very small ones.
+
+    Parameters
+    ----------
+    limits
+        The rows of `draw_band`, with one column for each shell.
     """
     shown = edges_px[:-1] < field_px
     edges = edges_px[: np.count_nonzero(shown) + 1]
@@ -422,7 +466,7 @@ def draw_weights_of_shells(
 
 
 def draw_totals(axes: Axes, totals: Vector, colour: str) -> None:
-    """Draw a histogram of the total scatter of all fits. totals: fractions of all light."""
+    """Draw a histogram of the total scatter of all fits; `totals` holds fractions of all light."""
     axes.hist(100 * totals, bins=min(25, max(5, totals.size // 4)), color=colour, label="folds")
     axes.set(xlabel="Diffusely scattered light (% of all light)", ylabel="Number of fits")
 

@@ -68,8 +68,14 @@ SCENES_KEPT = 24
 class Slice:
     """A row or a column of pixels through the centre of an occulter.
 
-    offset_px: distance of each pixel from the centre, with sign. observed_dn_s, simulated_dn_s: intensities. dark: True
-    for fully dark pixels.
+    Attributes
+    ----------
+    offset_px
+        Distance of each pixel from the centre, with sign.
+    observed_dn_s, simulated_dn_s
+        Intensity of each pixel, DN/s.
+    dark
+        True for fully dark pixels.
     """
 
     offset_px: Vector
@@ -82,9 +88,16 @@ class Slice:
 class FrameEvaluation:
     """Observed and simulated light in the occulter of one image, DN/s.
 
-    observed, simulated: intensities of the dark pixels, in the order of `dark`. noise_dn_s: standard error of the mean
-    of simulated minus observed over the dark pixels. centre_noise_dn_s: the same error for the dark pixels at the
-    centre; nan if there are no such pixels. along_x, along_y: slices; None for most images.
+    Attributes
+    ----------
+    observed, simulated
+        Intensities of the dark pixels, in the order of `dark`.
+    noise_dn_s
+        Standard error of the mean of simulated minus observed over the dark pixels.
+    centre_noise_dn_s
+        The same error for the dark pixels at the centre; nan if there are no such pixels.
+    along_x, along_y
+        The row and the column of pixels through the centre; None for most images.
     """
 
     index: int
@@ -222,8 +235,12 @@ class Superposed:
 def superposed(pe_pct: Plane, noise_pct: Plane) -> Superposed:
     """The maps of Eq. (4), at positions that are dark in at least LEAST_SHARE of the images.
 
-    pe_pct: PE of each image, as `superposed_maps` returns it. noise_pct: the same for each noise realisation, with the
-    shape (realisations, images, y, x).
+    Parameters
+    ----------
+    pe_pct
+        The PE of each image, as `superposed_maps` returns it.
+    noise_pct
+        The PE of each noise realisation, with the shape (realisations, images, y, x).
     """
     count = np.isfinite(pe_pct).sum(axis=0)
     shown = count >= max(LEAST_SHARE * len(pe_pct), 1)
@@ -260,7 +277,10 @@ def rms(values: Plane | Vector) -> float:
 class Evaluation:
     """The evaluation of one PSF, or of one PSF for each fold, on all images of a transit.
 
-    left_out: files that could not be evaluated, with the reasons.
+    Attributes
+    ----------
+    left_out
+        Files that could not be evaluated, with the reasons.
     """
 
     transit: Transit
@@ -280,13 +300,20 @@ def evaluate(
 ) -> Evaluation:
     """Simulate the light in every occulter of a transit, and compare it with the observed light.
 
-    psf_for_frame: returns the total PSF [y, x] for the index of an image, centre at [n // 2, n // 2]. A PSF is prepared
-    only once for all images for which this function returns the same array object. The images before and after an image
-    help to locate its occulter. These images are reconstructed with the PSF of the evaluated image, so that an image of
-    one fold never depends on the PSF of another fold. noise_realisations: number of noise realisations for each image;
-    they give the superposed maps of noise alone. seed: random seed of these realisations.
+    The images before and after an image help to locate its occulter. These images are reconstructed with the PSF of the
+    evaluated image, so that an image of one fold never depends on the PSF of another fold.
 
     Raises DataError "no-occulter" if no image can be evaluated.
+
+    Parameters
+    ----------
+    psf_for_frame
+        Function that returns the total PSF [y, x] for the index of an image, centre at [n // 2, n // 2]. A PSF is
+        prepared only once for all images for which this function returns the same array object.
+    noise_realisations
+        Number of noise realisations for each image; they give the superposed maps of noise alone.
+    seed
+        Random seed of these realisations.
     """
     kernels = [psf_for_frame(n) for n in range(len(transit.frames))]
     sliced = _sliced(transit.frames)

@@ -36,7 +36,10 @@ def evaluation_png(
 ) -> None:
     """Write a PNG with three rows of panels. If `study` is given, a fourth row shows the dark offsets.
 
-    title: the name of the evaluated PSF or fit.
+    Parameters
+    ----------
+    title
+        The name of the evaluated PSF or fit.
     """
     rows = 3 if study is None else 4
     figure = headed_figure(16.0, 3.7 * rows + 0.9, title, sentence(evaluation))

@@ -53,9 +53,14 @@ KernelOf = Callable[[int], Kernel]
 class ShapeErrors:
     """Errors of one shape on held-out images, in percent of the observed mean.
 
-    figures: value and standard error of each of FIGURES. minus_first: figures of this shape minus those of the softened
-    power law, with standard errors. parameters: value and standard error of each parameter in the fit to all images;
-    empty for free shells.
+    Attributes
+    ----------
+    figures
+        Value and standard error of each of FIGURES.
+    minus_first
+        Figures of this shape minus those of the softened power law, with standard errors.
+    parameters
+        Value and standard error of each parameter in the fit to all images; empty for free shells.
     """
 
     name: str
@@ -100,8 +105,13 @@ def compare_shapes_by_errors(
 ) -> ShapesByErrors:
     """Compare the softened power law of `solution` with both stretched shapes and with free shells.
 
-    seed: random seed of the bootstrap. Raises DataError "unknown-shape" if `solution` has another shape,
-    "too-few-images" for fewer than six images, and the errors of `invert` and `evaluate`.
+    Raises DataError "unknown-shape" if `solution` has another shape, "too-few-images" for fewer than six images, and
+    the errors of `invert` and `evaluate`.
+
+    Parameters
+    ----------
+    seed
+        Random seed of the bootstrap.
     """
     if solution.inversion.shape.name != SOFTENED_POWER_LAW.name:
         raise DataError(

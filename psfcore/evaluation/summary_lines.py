@@ -12,9 +12,14 @@ Json = dict[str, Any]
 
 
 def summary_lines(evaluation: Json, shapes: Json | None = None) -> list[str]:
-    """The lines of the table. evaluation: result of ``psfcore.evaluation.report.report`` (schema "evaluation/1").
+    """The lines of the table that summarises an evaluation.
 
-    shapes: the comparison of shapes, a result of ``psfcore.evaluation.shapes.ShapesByErrors.to_json``.
+    Parameters
+    ----------
+    evaluation
+        Result of ``psfcore.evaluation.report.report`` (schema "evaluation/1").
+    shapes
+        The comparison of shapes, a result of ``psfcore.evaluation.shapes.ShapesByErrors.to_json``.
     """
     maps = evaluation["superposed"]
     lines = ["simulated minus observed light in the occulter's disc, in percent of the observed light:"]

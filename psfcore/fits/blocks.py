@@ -70,8 +70,14 @@ _KNOWN_STARTS = (
 class FitsLimits:
     """Upper limits for a FITS file that is read.
 
-    max_pixels: largest number of pixels of an image. max_header_bytes: largest size of all headers together. max_hdus:
-    largest number of HDUs.
+    Attributes
+    ----------
+    max_pixels
+        Largest number of pixels of an image.
+    max_header_bytes
+        Largest size of all headers together.
+    max_hdus
+        Largest number of HDUs.
     """
 
     max_pixels: int
@@ -131,10 +137,16 @@ class Hdu:
 
 
 class Source:
-    """A FITS file that is read or skipped, only forwards. gzipped: whether it was compressed as a whole."""
+    """A FITS file that is read or skipped, only forwards.
+
+    Attributes
+    ----------
+    gzipped
+        Whether the file was compressed as a whole.
+    """
 
     def __init__(self, file: BinaryIO, *, gzipped: bool = False, damage: HeaderError | None = None) -> None:
-        """damage: the error of what lacks at the end of the file."""
+        """Read this file; `damage` is the error that is raised if bytes lack at the end of the file."""
         self.gzipped = gzipped
         self._file, self._damage = file, damage
         self._size = os.fstat(file.fileno()).st_size

@@ -124,8 +124,8 @@ def long_key(key: str) -> str:
 
 
 def number_of(value: object, *, text: bool = True) -> float | None:
-    """A finite number, as a card, a table in memory or numpy holds it; None for anything else. text: also a number as
-    text.
+    """A finite number, as a card, a table in memory or numpy holds it, and with `text` also a number that is written as
+    text; None for anything else.
     """
     if isinstance(value, str):
         value = float(re.sub("[dD]", "e", value)) if text and _NUMBER.fullmatch(value.strip()) else None

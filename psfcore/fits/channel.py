@@ -56,7 +56,7 @@ class Origin(Protocol):
 
 @dataclass(frozen=True)
 class PsfOrigin:
-    """The properties of a PSF that are known without its weights. cards: see `psfcore.psf.Psf`."""
+    """The properties of a PSF that are known without its weights; for `cards` see `psfcore.psf.Psf`."""
 
     name: str
     instrument: str | None
@@ -75,9 +75,13 @@ def check_channel(psf: Origin, header: Cards, *, other_channel: bool = False) ->
     """Compare a PSF with an image that has this header. Returns a warning, or None if both are of the same channel.
 
     The warning does not name the PSF: it becomes a part of the product, which must not depend on the name of a file.
+    Raises DataError "channel-mismatch" if the PSF is of another telescope, channel or filter than the image, unless
+    ``other_channel`` is true.
 
-    other_channel: whether the PSF may be of another telescope, channel or filter than the image. If it is, and
-    ``other_channel`` is False, raises DataError "channel-mismatch".
+    Parameters
+    ----------
+    other_channel
+        Whether the PSF may be of another telescope, channel or filter than the image.
     """
     differences = channel_differences(psf, header)
     if differences and not other_channel:

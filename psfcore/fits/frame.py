@@ -49,11 +49,11 @@ class Frame:
     scale_arcsec
         Plate scale along x and y, arcsec/px; None: unknown.
     on_detector
-        T of Eq. (2).
+        The matrix T of Eq. (2).
     roll_known
         Whether a card states the roll of the detector.
     interpolated
-        Why the pixels are not those of the detector; None: they are.
+        The reason why the pixels are not those of the detector; None: they are those of the detector.
     """
 
     scale_arcsec: tuple[float | None, float | None]
@@ -129,8 +129,12 @@ def _unit_without_card(header: Cards, matrix: Matrix) -> str:
 
 
 def plate_scale_arcsec(header: Cards, axis: int = 1) -> float | None:
-    """Plate scale of an axis, arcsec/px; None if the header does not give it in a unit of angle. axis: 1 for x, 2 for
-    y.
+    """Plate scale of an axis, arcsec/px; None if the header does not give it in a unit of angle.
+
+    Parameters
+    ----------
+    axis
+        Number of the axis: 1 for x, 2 for y.
     """
     return frame_of(header).scale_arcsec[axis - 1]
 

@@ -69,9 +69,15 @@ PIXEL_TROUBLE = (
 class StoredImage:
     """Pixels [y, x] (float64) and header of an image, as its file has them, and the number of its HDU.
 
-    bits: BITPIX of the image; None: unknown. others: the number, the name and the shape of each image that follows in
-    the file, if they were asked for; without planes of products. damaged: whether the card DATASUM contradicts the
-    data.
+    Attributes
+    ----------
+    bits
+        BITPIX of the image; None: unknown.
+    others
+        The number, the name and the shape of each image that follows in the file, if they were asked for; without
+        planes of products.
+    damaged
+        Whether the card DATASUM contradicts the data.
     """
 
     number: int
@@ -93,11 +99,16 @@ def prepare_library() -> None:
 def read_pixels(
     path: str | Path, limits: FitsLimits, *, hdu: int | None = None, others: bool = False
 ) -> StoredImage:
-    """Read the first 2-D image of a file, or the image in HDU `hdu`. others: look for further images.
+    """Read the first 2-D image of a file, or the image in HDU `hdu`.
 
     A plain image is read as it stands, in one pass through the file. A tile-compressed image is decoded by astropy in a
     process of its own, and its header is that of the image. Raises HeaderError, DataError "unreadable-pixels", and
     OSError if the disk fails.
+
+    Parameters
+    ----------
+    others
+        Whether to look for further images.
     """
     further: list[tuple[int, str, tuple[int, ...]]] = []
     with open_source(Path(path), limits) as source:
@@ -208,8 +219,12 @@ def decode_tiles(
     """Write the pixels of a tile-compressed image to ``target``; returns the type of its numbers, and whether DATASUM
     contradicts its tiles.
 
-    twice: decode twice with different contents of new memory, to find pixels that astropy did not write. Call this in a
-    limited process (`psfcore.limited`). Raises DataError "unreadable-pixels".
+    Call this in a limited process (`psfcore.limited`). Raises DataError "unreadable-pixels".
+
+    Parameters
+    ----------
+    twice
+        Whether to decode twice with different contents of new memory, to find pixels that astropy did not write.
     """
     with readable_pixels(path, f"HDU {number}"):
         data = _tiles(path, number)
@@ -240,8 +255,12 @@ def _tiles(path: str, number: int) -> NDArray[np.generic]:
 
 @contextmanager
 def readable_pixels(path: str | Path, part: str) -> Iterator[None]:
-    """Raise DataError "unreadable-pixels" for the errors of astropy in the block. part: the name of the part, for the
-    message.
+    """Raise DataError "unreadable-pixels" for the errors of astropy in the block.
+
+    Parameters
+    ----------
+    part
+        The name of the part, for the message.
     """
     try:
         yield

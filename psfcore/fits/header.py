@@ -110,9 +110,15 @@ class HeaderJson(HduJson, Observation):
 class HeaderSummary:
     """The first 2-D image of a file: its HDU, its shape (ny, nx) and values of its header.
 
-    A value is None if its card is missing or unusable. content: IMAGE, PRODUCT or PSF, see `content_of`. cards: the
-    usable cards that are compared to find out whether a PSF and an image fit together, and those of the publication of
-    a PSF.
+    A value is None if its card is missing or unusable.
+
+    Attributes
+    ----------
+    content
+        The kind of the content: IMAGE, PRODUCT or PSF, see `content_of`.
+    cards
+        The usable cards that are compared to find out whether a PSF and an image fit together, and those of the
+        publication of a PSF.
     """
 
     hdu: int
@@ -187,10 +193,15 @@ def content_of(header: Header) -> str:
 
 
 def check_not_deconvolved(content: str) -> None:
-    """Raise DataError if the content of a file is not IMAGE. content: the result of `content_of`.
+    """Raise DataError if the content of a file is not IMAGE.
 
     Codes: "already-deconvolved" for a product and for an image that other software deconvolved, "psf-as-image" for a
     PSF.
+
+    Parameters
+    ----------
+    content
+        The result of `content_of`.
     """
     if content in _NOT_AGAIN:
         code, message = _NOT_AGAIN[content]
@@ -198,11 +209,15 @@ def check_not_deconvolved(content: str) -> None:
 
 
 def origin_of(header: Cards) -> tuple[str | None, dict[str, str]]:
-    """The instrument of a PSF, and the cards that say for which images it is valid. header: the header of the PSF's
-    file.
+    """The instrument of a PSF, and the cards that say for which images it is valid.
 
     In a file that `psfcore.fits.psfs.write_psf` wrote (it has the card PSFNAME), INSTRUME is the name of an instrument
     file.
+
+    Parameters
+    ----------
+    header
+        The header of the PSF's file.
     """
     own = optional_text(header, "PSFNAME") is not None
     texts = {key: optional_text(header, key) for key in ORIGIN_CARDS}
@@ -274,7 +289,13 @@ def shape_of(header: Header) -> tuple[int, int]:
 
 
 def summary_of(image: Hdu, *, gzipped: bool) -> HeaderSummary:
-    """The summary of an HDU that `first_image` chose. gzipped: whether the file is compressed as a whole."""
+    """The summary of an HDU that `first_image` chose.
+
+    Parameters
+    ----------
+    gzipped
+        Whether the file is compressed as a whole.
+    """
     header = image.header
     compressed = card_flag(header, "ZIMAGE")
     return HeaderSummary(
@@ -387,7 +408,12 @@ def _json(value: object) -> JsonValue:
 def utc_time(given: datetime | str, name: str) -> datetime:
     """A time with a zone. A time without a zone is in UTC; a date means the start of that day.
 
-    name: name of the field, for the message. Raises DataError "bad-time".
+    Raises DataError "bad-time".
+
+    Parameters
+    ----------
+    name
+        Name of the field, for the message.
     """
     try:
         at = given if isinstance(given, datetime) else datetime.fromisoformat(given)

@@ -142,10 +142,17 @@ def write_image(
     """Write a product: float32 pixels, the input's header with its WCS, `cards`, `history` and planes.
 
     Cards that say how the input file stores its pixels are removed. DATAMIN, DATAMAX and DATAMEAN are computed again;
-    the cards with median, rms and percentiles of the input are removed.
-    planes: planes [y, x] by name (QUALITY, ERROR, PSF_ERROR), see above. The image is the first HDU, and
-    each plane is an image extension after it. plane_bits: for each plane of bits, the meaning of its bits.
+    the cards with median, rms and percentiles of the input are removed. The image is the first HDU, and each plane is
+    an image extension after it.
+
     Raises DataError "bad-plane" for a wrong shape, a wrong type or a name that is used twice.
+
+    Parameters
+    ----------
+    planes
+        Planes [y, x] by name (QUALITY, ERROR, PSF_ERROR), see above.
+    plane_bits
+        The meaning of the bits of each plane of bits.
     """
     header = _kept_header(image.header)
     pixels = image.pixels.astype(np.float32)
@@ -191,8 +198,12 @@ def _plane_hdu(
 ) -> fits.ImageHDU:
     """The HDU of a plane [y, x]. Bits are stored as uint8 or uint16, numbers as float32 in the unit of the image.
 
-    image_header: the header of the product's image; the cards of its coordinates are copied. meanings: the meaning of
-    each bit, for a plane of bits; None for other planes.
+    Parameters
+    ----------
+    image_header
+        The header of the product's image; the cards of its coordinates are copied.
+    meanings
+        The meaning of each bit, for a plane of bits; None for other planes.
     """
     is_bits = plane.dtype.kind in "ub"
     stored = plane.astype(_BITS_STORED.get(plane.dtype.itemsize, np.uint16) if is_bits else np.float32)
@@ -277,10 +288,16 @@ def _card_value(card: fits.Card) -> object:
 
 @dataclass(frozen=True)
 class Described:
-    """header: the header of the input, without the cards that are not valid for the product. cards: the product's own
-    cards.
+    """The cards that describe a product.
 
-    history: lines of HISTORY with the values of the input.
+    Attributes
+    ----------
+    header
+        The header of the input, without the cards that are not valid for the product.
+    cards
+        The cards that only the product has.
+    history
+        Lines of HISTORY with the values of the input.
     """
 
     header: fits.Header
@@ -291,7 +308,12 @@ class Described:
 def described(source: fits.Header, *, filename: str, creator: str, sha256: str | None) -> Described:
     """The cards for a product of the image with the header ``source``.
 
-    filename: name of the product. sha256: hash of the input's file; None: not known.
+    Parameters
+    ----------
+    filename
+        Name of the product.
+    sha256
+        Hash of the input's file; None: not known.
     """
     # A file name may fill the whole card, so cards with a file name have no comment.
     cards: dict[str, tuple[CardValue, str]] = {

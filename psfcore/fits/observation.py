@@ -46,9 +46,14 @@ def read_observation(
 ) -> Image:
     """Read an image of a file and mask its unusable pixels.
 
-    saturation_dn: the saturation level in DN of one exposure; None: `saturation` finds it. hdu: number of the HDU;
-    None: the first 2-D image. Raises HeaderError for an unusable header; DataError "unreadable-pixels", and the errors
-    of `observation_of`.
+    Raises HeaderError for an unusable header; DataError "unreadable-pixels", and the errors of `observation_of`.
+
+    Parameters
+    ----------
+    saturation_dn
+        The saturation level in DN of one exposure; None: `saturation` finds it.
+    hdu
+        Number of the HDU; None: the first 2-D image.
     """
     stored = read_pixels(path, limits, hdu=hdu, others=True)
     return _with_planes(
@@ -63,10 +68,16 @@ def observation_of_hdus(
     chosen: int | None = None,
     saturation_dn: float | None = None,
 ) -> Image:
-    """The image of one HDU of astropy, with the planes in the HDUs after it. hdus: the HDUs with an image of two axes,
-    by their numbers.
+    """The image of one HDU of astropy, with the planes in the HDUs after it.
 
-    chosen: `number`, if the caller named it. Raises the errors of `observation_of`.
+    Raises the errors of `observation_of`.
+
+    Parameters
+    ----------
+    hdus
+        The HDUs with an image of two axes, by their numbers.
+    chosen
+        Number of the HDU, the same as `number`, if the caller named it; None: the caller named none.
     """
     hdu = hdus[number]
     # Before its pixels are read: astropy then removes the cards that tell lost pixels.
@@ -92,7 +103,12 @@ def _with_planes(
 ) -> Image:
     """The image with its planes among the other images of the file. Warnings name the others, and damage.
 
-    read(number): the pixels of one of the others. chosen: the number of the HDU, if the caller named it.
+    Parameters
+    ----------
+    read
+        Function of the number of an HDU that gives the pixels of this HDU.
+    chosen
+        The number of the HDU, if the caller named it; None: the caller named none.
     """
     planes: dict[str, NDArray[np.generic]] = {}
     others: list[str] = []
@@ -165,8 +181,13 @@ def observation_of(
 ) -> Image:
     """The image of pixels [y, x] and a header, with its unusable pixels masked.
 
-    bits, planes: see `unusable.unusable_pixels`. Raises DataError "not-2d", "too-small", "no-exposure",
-    "saturation-unit", "all-nan", "all-saturated", "pixel-too-large", "no-signal".
+    Raises DataError "not-2d", "too-small", "no-exposure", "saturation-unit", "all-nan", "all-saturated",
+    "pixel-too-large", "no-signal".
+
+    Parameters
+    ----------
+    bits, planes
+        BITPIX of the stored image, and further images by name, see `unusable.unusable_pixels`.
     """
     mask, warnings = unusable_pixels(pixels, header, bits, planes or {})
     if (unused := (mask != 0) & np.isfinite(pixels)).any():

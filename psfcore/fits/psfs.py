@@ -36,7 +36,11 @@ def write_psf(path: str | Path, psf: Psf, *, instrument_file: bytes | None = Non
 
     The tables are PROFILE (weight by radius), FIT (the fitted shape, if any) and INSTRUMENT. Weights are stored as
     float32. The rounding changes each weight by at most 6e-8 of its value, and the sum by less than 1e-7.
-    instrument_file: the TOML text from which the PSF was built. It is stored unchanged in INSTRUMENT.
+
+    Parameters
+    ----------
+    instrument_file
+        The TOML text from which the PSF was built. It is stored unchanged in INSTRUMENT.
     """
     hdus: list[fits.PrimaryHDU | fits.ImageHDU] = [
         fits.PrimaryHDU(psf.kernel.astype(np.float32), _psf_header(psf))
@@ -139,10 +143,16 @@ def read_psf(path: str | Path, limits: FitsLimits, *, parts: bool = True) -> Psf
     """Read a PSF from the first 2-D image of a file, and its metadata from the header.
 
     Weights are not changed. The file must have the centre of the PSF at [ny // 2, nx // 2]. If the card PSFNAME is
-    missing, the PSF is named after the file.
-    parts: also read the components, the instrument description and the fitted shape, if `write_psf` wrote the file. A
-    convolution does not need them. The provenance has "doi" and "citation", if the file says how to cite the PSF.
+    missing, the PSF is named after the file. The provenance has "doi" and "citation", if the file says how to cite the
+    PSF.
+
     Raises HeaderError; DataError "unreadable-pixels" and the errors of `Psf` ("psf-not-centred", "psf-sum", ...).
+
+    Parameters
+    ----------
+    parts
+        Whether to read also the components, the instrument description and the fitted shape, if `write_psf` wrote the
+        file. A convolution does not need them.
     """
     stored = read_pixels(path, limits)
     kernel, header = stored.pixels, stored.header
@@ -262,9 +272,14 @@ def _pixels(hdus: Sequence[Hdu]) -> int:
 
 @contextmanager
 def _first_hdus(path: str, count: int) -> Iterator[list[fits.PrimaryHDU | fits.ImageHDU]]:
-    """The first HDUs of a file. count: as many as `all_hdus` finds.
+    """The first HDUs of a file.
 
     If a damaged size ends an HDU too early, astropy takes what follows for a header, and may read on without an end.
+
+    Parameters
+    ----------
+    count
+        The number of HDUs that `all_hdus` finds.
     """
     with fits.open(path, memmap=False, disable_image_compression=True) as hdus:
         yield [hdus[number] for number in range(count)]

@@ -63,11 +63,16 @@ def with_saturation(
 ) -> Image:
     """The image with its saturated pixels masked, and with the record of how they were found.
 
-    requested_dn, instrument_dn: the levels in DN of one exposure that the request and the instrument file give. The
-    level of the request replaces the level of the instrument file. If several levels remain, the lowest one is used. If
-    the request gives no level, the count of the header is compared, and the pixels are tested, see Eq. (1). Raises
-    DataError "saturation-unit" if the request gives a level and the unit of the image is neither counts nor a rate of
-    counts, and "no-exposure".
+    The level of the request replaces the level of the instrument file. If several levels remain, the lowest one is
+    used. If the request gives no level, the count of the header is compared, and the pixels are tested, see Eq. (1).
+
+    Raises DataError "saturation-unit" if the request gives a level and the unit of the image is neither counts nor a
+    rate of counts, and "no-exposure".
+
+    Parameters
+    ----------
+    requested_dn, instrument_dn
+        The levels in DN of one exposure that the request and the instrument file give.
     """
     level = _level(image, requested_dn, instrument_dn)
     if level.found != REQUEST:
@@ -198,7 +203,14 @@ def _counted(image: Image, level: Saturation) -> Saturation:
 def largest_value(pixels: Pixels, valid: NDArray[np.bool_]) -> tuple[float, int, float]:
     """The largest valid value, the number n of pixels that have it, and the probability P(n) of Eq. (1).
 
-    pixels: [y, x]. valid: True for the pixels that are tested. P is 1 if no valid pixel is below the largest value.
+    P is 1 if no valid pixel is below the largest value.
+
+    Parameters
+    ----------
+    pixels
+        The pixels [y, x].
+    valid
+        True for the pixels that are tested.
     """
     top = float(np.max(pixels, initial=-np.inf, where=valid))
     count = int(np.count_nonzero((pixels == top) & valid))

@@ -23,9 +23,13 @@ _STORAGE = ("EXTEND", "PCOUNT", "GCOUNT", "BSCALE", "BZERO", "BLANK")
 def check_is_psf(path: str | Path, summary: HeaderSummary, limits: FitsLimits) -> None:
     """Raise DataError if a file is not a PSF. The weights are read in a process of its own.
 
-    summary: the summary of the file's header. Codes: those of `check_no_product`; "psf-nonfinite", "psf-negative",
-    "psf-sum", "psf-not-centred", "psf-off-centre" for weights that no PSF can have; "unreadable-pixels"; and the codes
-    of HeaderError.
+    Codes: those of `check_no_product`; "psf-nonfinite", "psf-negative", "psf-sum", "psf-not-centred", "psf-off-centre"
+    for weights that no PSF can have; "unreadable-pixels"; and the codes of HeaderError.
+
+    Parameters
+    ----------
+    summary
+        The summary of the file's header.
     """
     check_no_product(summary)
     with open(os.devnull, "wb") as unused:

@@ -40,9 +40,14 @@ _COUNTS = re.compile(r"(dn|adu|ct|counts?|electrons?|photons?|ph)(/?pix(el)?)?",
 
 @dataclass(frozen=True)
 class PixelUnit:
-    """The unit of an image. text: the unit as the header writes it; None: the header gives no unit.
+    """The unit of an image.
 
-    scale: counts, or counts per second, in one unit; 1 for other units.
+    Attributes
+    ----------
+    text
+        The unit as the header writes it; None: the header gives no unit.
+    scale
+        Counts, or counts per second, in one unit; 1 for other units.
     """
 
     text: str | None
@@ -93,10 +98,15 @@ def check_linear(header: Cards) -> None:
 
 
 def per_dn(unit: PixelUnit, exposure_s: float | None, purpose: str) -> float:
-    """DN of one exposure in one unit of the image. purpose: what the number is needed for.
+    """DN of one exposure in one unit of the image.
 
     Raises DataError "no-exposure" if the image is a rate without an exposure time, and "saturation-unit" if its unit is
     neither counts nor a rate.
+
+    Parameters
+    ----------
+    purpose
+        The purpose of the number, for the message.
     """
     scale = unit.dn_per_unit(exposure_s)
     if scale is not None:

@@ -48,8 +48,12 @@ def unusable_pixels(
 ) -> tuple[NDArray[np.uint8], dict[str, str]]:
     """The mask [y, x] (bits of MaskBit) of pixels without a measurement, and warnings by their codes.
 
-    bits: BITPIX of the image as it was stored; None: unknown. planes: images of the same shape, by their names (see the
-    module).
+    Parameters
+    ----------
+    bits
+        BITPIX of the stored image; None: unknown.
+    planes
+        Images of the same shape, by their names (see the module).
     """
     mask = np.where(np.isfinite(pixels), np.uint8(0), np.uint8(MaskBit.NONFINITE))
     warnings = {}

@@ -58,7 +58,12 @@ _USED_SHARE = 1e-6
 class ArmProfile:
     """Light along an arm: the mean over the strip at each distance from the flare, and its noise if known.
 
-    rows, columns: the pixels of the strip; member: for each pixel, the index of its distance.
+    Attributes
+    ----------
+    rows, columns
+        The pixels of the strip.
+    member
+        The index of the distance of each pixel.
     """
 
     centre_xy: tuple[int, int]
@@ -123,9 +128,12 @@ class FlareFit:
 class FlareComparison:
     """The fits of the total PSF and of its diffraction PSF alone along one arm of one flare.
 
-    diffraction: None if the file of the PSF does not separate diffraction from scatter.
-    explained: the share of the changes beside the arm that the total PSF and its fitted box explain, see
-    `explained_share`.
+    Attributes
+    ----------
+    diffraction
+        The fit of the diffraction PSF; None if the file of the PSF does not separate diffraction from scatter.
+    explained
+        The share of the changes beside the arm that the total PSF and its fitted box explain, see `explained_share`.
     """
 
     profile: ArmProfile
@@ -161,9 +169,14 @@ def flare_centre(difference: Plane, usable: Flags, usable_before: Flags) -> tupl
     """Position (x, y) of the flare, px.
 
     The position is the middle of the largest patch of pixels that are unusable in the flare image but usable in the
-    image before. If there is no such patch, the position is the brightest pixel of the smoothed difference. usable,
-    usable_before: True for the usable pixels of the flare image and of the image before. Raises DataError
-    "flare-no-light" if no pixel became brighter.
+    image before. If there is no such patch, the position is the brightest pixel of the smoothed difference.
+
+    Raises DataError "flare-no-light" if no pixel became brighter.
+
+    Parameters
+    ----------
+    usable, usable_before
+        True for the usable pixels of the flare image and of the image before.
     """
     labels, count = ndimage.label(~usable & usable_before, structure=np.ones((3, 3)))
     if count:
@@ -190,8 +203,13 @@ def arm_profile(
 ) -> ArmProfile:
     """Profile along the arm that leaves the centre at `arm_deg`, degrees from +x towards +y.
 
-    Distances at which less than half of the strip is usable are left out. variance [y, x]: the variance of each pixel
-    of the difference. Raises DataError "flare-bad-centre", "flare-short-arm".
+    Distances at which less than half of the strip is usable are left out. Raises DataError "flare-bad-centre",
+    "flare-short-arm".
+
+    Parameters
+    ----------
+    variance
+        The variance [y, x] of each pixel of the difference.
     """
     ny, nx = difference.shape
     if not (0 <= centre_xy[0] < nx and 0 <= centre_xy[1] < ny):
@@ -233,8 +251,12 @@ def arm_profile(
 def fit_flare(profile: ArmProfile, kernel: Plane) -> FlareFit:
     """Fit the intensities of the box so that the simulated profile matches the observed one, Eq. (2).
 
-    kernel: a PSF [y, x], centre at [n // 2, n // 2]. Raises DataError "flare-no-light" if the mean difference at 60 to
-    70 px is not positive.
+    Raises DataError "flare-no-light" if the mean difference at 60 to 70 px is not positive.
+
+    Parameters
+    ----------
+    kernel
+        A PSF [y, x], centre at [n // 2, n // 2].
     """
     # Each column is the profile of unit light in one pixel of the box.
     design = np.stack(

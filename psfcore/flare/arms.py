@@ -76,9 +76,18 @@ class Peak:
 class ArmMeasurement:
     """Directions of the arms and spacing of the orders, with 1-sigma errors.
 
-    angles_deg: ascending, within -90 to 90. spacing_px: the same for all arms. reduced_chi2: chi^2 of the fitted pixels
-    divided by the degrees of freedom; the errors are multiplied by its square root. model [y, x]: the fitted image.
-    fitted [y, x]: True for the fitted pixels.
+    Attributes
+    ----------
+    angles_deg
+        Directions of the arms, ascending, within -90 to 90.
+    spacing_px
+        Spacing of the orders, the same for all arms.
+    reduced_chi2
+        The chi^2 of the fitted pixels divided by the degrees of freedom; the errors are multiplied by its square root.
+    model
+        The fitted image [y, x].
+    fitted
+        True for the fitted pixels [y, x].
     """
 
     angles_deg: tuple[float, ...]

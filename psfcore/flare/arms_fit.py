@@ -31,7 +31,14 @@ _RANK = 1e-11  # eigenvalues below this fraction of the largest eigenvalue are t
 class Geometry:
     """The quantities that the fit does not change.
 
-    centre: (x, y) px. half_px: half size of S. radii_px: the smallest and the largest radius of the fitted orders.
+    Attributes
+    ----------
+    centre
+        The centre of the flare (x, y), px.
+    half_px
+        Half size of S.
+    radii_px
+        The smallest and the largest radius of the fitted orders.
     """
 
     centre: tuple[float, float]
@@ -164,7 +171,14 @@ def check_enough_orders(arm: Indices, arms: int) -> None:
 class FitState:
     """The fitted quantities.
 
-    pattern: the angles (radian), then the spacing (px). amplitude: A_ak. source: the coefficients of S [y, x].
+    Attributes
+    ----------
+    pattern
+        The angles (radian), then the spacing (px).
+    amplitude
+        The amplitudes A_ak.
+    source
+        The coefficients of S [y, x].
     """
 
     pattern: Vector
@@ -185,9 +199,17 @@ class FitState:
 class FitResult:
     """The result of a fit, apart from its state.
 
-    error: the standard errors of pattern and amplitudes. reduced_chi2: chi^2 divided by the degrees of freedom, which
-    are the number of fitted pixels minus the number of fitted quantities. light: the fitted light of each pixel, DN.
-    why: the reason why the fit stopped.
+    Attributes
+    ----------
+    error
+        The standard errors of pattern and amplitudes.
+    reduced_chi2
+        The chi^2 divided by the degrees of freedom, which are the number of fitted pixels minus the number of fitted
+        quantities.
+    light
+        The fitted light of each pixel, DN.
+    why
+        The reason why the fit stopped.
     """
 
     error: Vector
@@ -292,8 +314,12 @@ class _Bases:
     slope_y: Vector
 
     def stamps(self, source: Plane, *, slope: str = "") -> Vector:
-        """The values of S on the box of each order [order, y, x]. slope: "x" or "y" for the derivative along this
-        axis.
+        """The values of S on the box of each order [order, y, x].
+
+        Parameters
+        ----------
+        slope
+            "x" or "y" for the derivative along this axis.
         """
         along_x = self.slope_x if slope == "x" else self.x
         along_y = self.slope_y if slope == "y" else self.y
@@ -386,8 +412,12 @@ def _columns_of_pattern(orders: Orders, bases: _Bases, state: FitState) -> Plane
 def _without_planes(orders: Orders, weighted: Vector) -> Vector:
     """Subtract from each column its best-fitting planes around the orders.
 
-    weighted: the columns, or one column, already divided by sigma. With these columns the fit needs no parameters for
-    the planes, and its solution and errors stay the same.
+    With these columns the fit needs no parameters for the planes, and its solution and errors stay the same.
+
+    Parameters
+    ----------
+    weighted
+        The columns, or one column, already divided by sigma.
     """
     rest = weighted.copy()
     for pixels, basis in orders.planes():

@@ -24,7 +24,12 @@ WELL_MATCHED_PCT = 3.0
 class FlareTest:
     """The comparison of a PSF with a flare, and the planes [y, x] that were used.
 
-    difference: the light of the flare, in ``unit``. usable: True for pixels that are valid in both images.
+    Attributes
+    ----------
+    difference
+        The light of the flare, in ``unit``.
+    usable
+        True for pixels that are valid in both images.
     """
 
     comparison: FlareComparison

@@ -48,8 +48,14 @@ DRAWS, LEVEL = 100, 0.9
 
 @dataclass(frozen=True)
 class TrueCause:
-    """A true cause. name: its name in the library; None if it is withheld. families: the right families, the main one
-    first.
+    """A true cause.
+
+    Attributes
+    ----------
+    name
+        Name of the cause in the library; None if the cause is withheld.
+    families
+        The right families, the main one first.
     """
 
     transit: Transit
@@ -69,8 +75,14 @@ class Bound:
 
 
 def bounds(without: Transit, causes: Sequence[TrueCause], seed: int = 1) -> tuple[Bound, ...]:
-    """The bound of every cause alone. without: the noise-free images without any cause. Raises the errors of
-    `invert`.
+    """The bound of every cause alone.
+
+    Raises the errors of `invert`.
+
+    Parameters
+    ----------
+    without
+        The noise-free images without any cause.
     """
     solution = invert(without)
     true = [_true_effect(number, cause, without) for number, cause in enumerate(causes)]

@@ -32,9 +32,14 @@ from psfcore.transit.transit import Place
 def corrected_psf(found: Diagnosis, name: str, version: str, provenance: dict[str, object]) -> Psf:
     """The corrected PSF of a diagnosis, on the full reach, with the components DIFFRACTION and SCATTER.
 
-    provenance: the software and the parents of the PSF. This function adds the effects, their parameters with errors,
-    the gap without and with these effects, and the input files. Raises DataError "no-answer" if the diagnosis made no
-    full refit, "bad-effects" if an added effect fails, and the errors of `Psf`.
+    Raises DataError "no-answer" if the diagnosis made no full refit, "bad-effects" if an added effect fails, and the
+    errors of `Psf`.
+
+    Parameters
+    ----------
+    provenance
+        The software and the parents of the PSF. This function adds the effects, their parameters with errors, the gap
+        without and with these effects, and the input files.
     """
     added = found.corrected
     if added is None:

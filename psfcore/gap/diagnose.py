@@ -58,10 +58,16 @@ MOST_EXAMPLES = 3  # of images that were not used, in a caution
 
 @dataclass(frozen=True, eq=False)
 class Shrinking:
-    """How far causes close the gap.
+    """How far causes close the gap. Both closures are None if there is no gap.
 
-    closure: the closure if blocks of time are held out. closure_by_pointing: the closure if one pointing at a time is
-    held out. Both are None if there is no gap. held_out_fall: `closure.fall` for the blocks of time.
+    Attributes
+    ----------
+    closure
+        The closure if blocks of time are held out.
+    closure_by_pointing
+        The closure if one pointing at a time is held out.
+    held_out_fall
+        `closure.fall` for the blocks of time.
     """
 
     closure: Interval | None
@@ -96,7 +102,7 @@ class Diagnosis:
     corrected
         The full refit with the told causes, if they are effects of the library and the refit succeeded.
     shapes
-        The shape of each alternative that is another form of its family, by the name of the family.
+        The shape of each alternative that is another form of its family; the key is the name of the family.
     residual, residual_after
         The residuals of held-out images without and with the told causes.
     cautions
@@ -331,8 +337,14 @@ def _shrinking(
 ) -> tuple[Shrinking, HeldOut | None]:
     """How far a fit closes the gap, and the held-out residuals with it.
 
-    before: the held-out residuals without any cause, for each scheme. exists: whether there is a gap. refit: the full
-    refit of the fit; its results are used where it holds out the same images.
+    Parameters
+    ----------
+    before
+        The held-out residuals without any cause, for each scheme.
+    exists
+        Whether there is a gap.
+    refit
+        The full refit of the fit; its results are used where it holds out the same images.
     """
     base = len(fit.model.evidence.base)
     after = [hold_out(fit.model, fit.step.columns[base:], scheme) for scheme in schemes]
@@ -446,7 +458,14 @@ def caution_of_closure(label: str, gap_pct: float, error_pct: float) -> tuple[st
     """A sentence if the closure by some effects says little, because their parameters are too uncertain without the
     held-out images.
 
-    label: the effects. gap_pct: the gap in held-out images, %. error_pct: the error of their prediction, %, rms.
+    Parameters
+    ----------
+    label
+        Names of the effects, as text.
+    gap_pct
+        The gap in held-out images, %.
+    error_pct
+        The rms error of the prediction of these images, %.
     """
     if error_pct <= gap_pct:
         return ()

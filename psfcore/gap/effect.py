@@ -26,8 +26,12 @@ Stage = Literal["scene", "optics", "detector"]
 class EffectParameter:
     """A parameter of an effect.
 
-    likely: the largest plausible size of the parameter, in its unit; ten times this size is hardly credible. positive:
-    whether the parameter cannot be negative, for example because it is a share of light.
+    Attributes
+    ----------
+    likely
+        The largest plausible size of the parameter, in its unit; ten times this size is hardly credible.
+    positive
+        Whether the parameter cannot be negative, for example because it is a share of light.
     """
 
     name: str
@@ -57,9 +61,9 @@ class Effect:
     Attributes
     ----------
     family
-        The name of its family in `evidence.tree`; empty: a family of its own.
+        The name of the family of the effect in `evidence.tree`; empty: the effect is a family alone.
     cause
-        A sentence for the report.
+        A sentence about the cause, for the report.
     settled_by
         An observation that would confirm the effect, or exclude it.
     axes
@@ -74,7 +78,7 @@ class Effect:
         The approximate number of positions or templates among which the effect searches; it raises the p-value and the
         detection limit.
     distinguished
-        Function of the view that returns how many of these positions or templates the data distinguish
+        Function of the view that returns how many of the positions or templates of `trials` the data distinguish
         (`search.distinguished`). A larger number lowers the evidence. None: the data distinguish all of them.
     held
         Function of the view, for an effect that searches for a position or a template: it returns the same effect with

@@ -33,7 +33,7 @@ def bad_effects(source: str, what: str) -> DataError:
     Parameters
     ----------
     source
-        The file or module.
+        The file or module with the effects.
     what
         A description of the mistake.
     """

@@ -48,9 +48,14 @@ _BRIGHTNESS_STREAM = 3001
 class Planned:
     """The limits of a plan.
 
-    searched: effects that search for a position or form; their limits hold for the position or form that was found.
-    settled_by: the observation that confirms an effect, by effect. left_out: the reasons why the fit cannot use images,
-    by the name that the simulation gives the image.
+    Attributes
+    ----------
+    searched
+        Effects that search for a position or form; their limits hold for the position or form that was found.
+    settled_by
+        The observation that confirms an effect, by effect.
+    left_out
+        The reasons why the fit cannot use images, by the name that the simulation gives the image.
     """
 
     plan: Plan
@@ -105,10 +110,16 @@ def limits_of_file(
 ) -> Planned:
     """The limits of the plan in a file, or of a transit (`read_plan`).
 
-    instrument: the instrument whose diffraction PSF is used; None: the instrument of the transit or, if it names none,
-    INSTRUMENT. diffraction: a file with a diffraction PSF; None: the file that the transit names or, if it names none,
-    the diffraction PSF of the instrument. Raises the errors of `read_plan`,
-    of reading or building a diffraction PSF, and of `planned_limits`.
+    Raises the errors of `read_plan`, of reading or building a diffraction PSF, and of `planned_limits`.
+
+    Parameters
+    ----------
+    instrument
+        The instrument whose diffraction PSF is used; None: the instrument of the transit or, if it names none,
+        INSTRUMENT.
+    diffraction
+        A file with a diffraction PSF; None: the file that the transit names or, if it names none, the diffraction PSF
+        of the instrument.
     """
     found = read_plan(path, fits_limits)
     _check_images(found.plan)
@@ -128,9 +139,16 @@ def planned_limits(
     threads: int = 1,
     progress: Progress = lambda stage, step, steps: None,
 ) -> Planned:
-    """The limits of a plan. diffraction: weights [y, x], centre at [n // 2, n // 2], sum 1. seed: for scenes and noise.
+    """The limits of a plan.
 
     Raises DataError "too-few-images", and the errors of `true_sky` and `invert`.
+
+    Parameters
+    ----------
+    diffraction
+        The diffraction PSF: weights [y, x], centre at [n // 2, n // 2], sum 1.
+    seed
+        Seed of the scenes and of the noise.
     """
     _check_images(plan)
     transit = _noise_free(plan, diffraction, seed, threads)

@@ -26,7 +26,13 @@ class ParameterJson(NumberJson):
 
 
 class AlternativeJson(TypedDict):
-    """One alternative of a cause. effect: None for another form of the family."""
+    """One alternative of a cause.
+
+    Attributes
+    ----------
+    effect
+        The name of the effect; None for another form of the family.
+    """
 
     stage: str
     family: str
@@ -116,7 +122,13 @@ class PointingJson(TypedDict):
 
 
 class LabelJson(TypedDict):
-    """A cause of a hypothesis. effect: None for another form of the family."""
+    """A cause of a hypothesis.
+
+    Attributes
+    ----------
+    effect
+        The name of the effect; None for another form of the family.
+    """
 
     family: str
     effect: str | None

@@ -63,7 +63,7 @@ class View:
         return {}
 
     def once(self, name: str, compute: Callable[[], Result]) -> Result:
-        """The result of `compute`, which runs once for each view, for example a search. name: of the result."""
+        """The result of `compute` under this name. It is computed once for each view, for example by a search."""
         if name not in self._results:
             self._results[name] = compute()
         return cast(Result, self._results[name])
@@ -214,7 +214,10 @@ class View:
     def blurred(self, n: int, slope: Blur, weight: Field | None = None) -> Field:
         """The change of image n by dH: its scene with the occulter in front, convolved with dH (`slope`) [y, x], DN/s.
 
-        weight: a factor [y, x] for the light of each scene pixel before the convolution (None: 1).
+        Parameters
+        ----------
+        weight
+            A factor [y, x] for the light of each scene pixel before the convolution (None: 1).
         """
         scene = self.occulted_scenes[n]
         if weight is not None:

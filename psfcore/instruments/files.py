@@ -77,8 +77,12 @@ def match_instrument(cards: Mapping[str, object]) -> str | None:
 
     Several instruments may match: the file of a variant of an instrument, for one filter or plate scale, has the cards
     of the instrument and further ones. The instrument with the most cards is chosen; of several, the first by name.
-    cards: TELESCOP, OBSRVTRY, INSTRUME, DETECTOR, FILTER, EC_FW1_ and EC_FW2_ as texts, WAVELNTH in angstrom, CDELT1 in
-    arcsec/px. `psfcore.fits.header.known_instrument` reads them from a header.
+
+    Parameters
+    ----------
+    cards
+        The values of TELESCOP, OBSRVTRY, INSTRUME, DETECTOR, FILTER, EC_FW1_ and EC_FW2_ as texts, of WAVELNTH in
+        angstrom, and of CDELT1 in arcsec/px. `psfcore.fits.header.known_instrument` reads them from a header.
     """
     best, most = None, 0
     for name in instrument_names():

@@ -83,7 +83,13 @@ class Match(TypedDict, total=False):
 
 @dataclass(frozen=True, kw_only=True, config=_CONFIG)
 class GainMode:
-    """Saturation and noise of one readout mode. ``basis``: the origin of the numbers."""
+    """Saturation and noise of one readout mode.
+
+    Attributes
+    ----------
+    basis
+        The origin of the numbers.
+    """
 
     saturation_dn: Positive | None = None
     photon_gain_dn: Positive | None = None
@@ -114,7 +120,10 @@ class Sector:
 class Aperture:
     """The entrance pupil: a disc, a ring (the centre is obscured), a sector of one of these, or a polygon.
 
-    ``corners_mm``: the corners (x, y) of the polygon from the optical axis, all within the circle of ``diameter_mm``.
+    Attributes
+    ----------
+    corners_mm
+        The corners (x, y) of the polygon from the optical axis, all within the circle of ``diameter_mm``.
     """
 
     diameter_mm: Size
@@ -195,14 +204,15 @@ class Mesh:
     pitch_um
         The distance from the centre of an opening to the centre of the next opening.
     angle_deg
-        The direction of this step; in a square mesh, the wires have this direction and the one across it.
+        The direction from the centre of an opening to the centre of the next opening; in a square mesh, the wires have
+        this direction and the direction across it.
     windows
         Number of windows of the diffraction series in each direction. At the entrance, this is the diameter of the
         aperture divided by the pitch; at the filter wheel, the number of windows that the light crosses.
     share
         The fraction of the light that crosses this mesh, if several meshes are mounted side by side.
     basis
-        "assumed" if any of these numbers is; each use of the PSF then says so.
+        "assumed" if any number of the mesh is assumed; each use of the PSF then says so.
     """
 
     name: Name
@@ -261,7 +271,13 @@ class MaskImage:
 
 @dataclass(frozen=True, kw_only=True, config=_CONFIG)
 class Mount:
-    """The mount of the entrance filter. ``basis``: the origin of its description."""
+    """The mount of the entrance filter.
+
+    Attributes
+    ----------
+    basis
+        The origin of the description of the mount.
+    """
 
     basis: Literal["drawing", "assumed"]
     rays: Annotated[tuple[Rays, ...], Field(max_length=MOST_RAYS)] = ()
@@ -342,8 +358,11 @@ class Scatter:
 class Instrument:
     """An instrument: all quantities from which a PSF is computed.
 
-    ``turn_deg``: the angle from the +x axis of the detector to that of the images, degrees. The angles and corners of a
-    read instrument are those on the images.
+    Attributes
+    ----------
+    turn_deg
+        The angle from the +x axis of the detector to the +x axis of the images, degrees. The angles and corners of a
+        read instrument are those on the images.
     """
 
     name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,39}$")]

@@ -31,15 +31,22 @@ _STATUS = re.compile(r'^status = "draft" +# (.+)$', re.MULTILINE)
 def version_text(version: str, status: str, identity: str | None = None) -> str:
     """The version of a PSF that is built from an instrument file with this version and status.
 
-    identity: of its recipe; None: it has no recipe.
+    Parameters
+    ----------
+    identity
+        Identity of the recipe of the PSF; None: the PSF has no recipe.
     """
     draft = f"-{DRAFT}" if status == DRAFT else ""
     return f"{version}{draft}{'' if identity is None else f'+{identity[:8]}'}"
 
 
 def title(name: str, version: str, status: str | None) -> str:
-    """A PSF with its version and status, such as "PSF aia_171 1.0.0 (certified)". status None: it does not exist
-    yet, or a status that changes must not be told.
+    """A PSF with its version and status, such as "PSF aia_171 1.0.0 (certified)".
+
+    Parameters
+    ----------
+    status
+        The status; None if the PSF does not exist yet, or if a status that changes must not be told.
     """
     return " ".join(filter(None, ("PSF", name, version, status and f"({status})")))
 

@@ -85,7 +85,7 @@ class Telescope:
     angstrom
         The wavelengths of the images that the entry describes; empty: all wavelengths.
     reason
-        Why there is no file.
+        The reason why there is no instrument file.
     ways
         Sentences about the steps with which a publication or a file helps; the recommended step comes first.
     """
@@ -235,7 +235,13 @@ def unknown_instrument(header: Observation, psfs: Sequence[SuitedPsf] = ()) -> D
 
 
 def _seen(named: str, telescope: Telescope | None, header: Observation) -> str:
-    """The telescope and the channel of an image, for a message. named: the words of its header cards."""
+    """The telescope and the channel of an image, for a message.
+
+    Parameters
+    ----------
+    named
+        The words of the header cards of the image.
+    """
     channel = channel_of(None, header["wavelnth"])
     cards = f"'{named or 'an unnamed instrument'}'"
     return (f"{telescope.name} ({cards})" if telescope else cards) + (

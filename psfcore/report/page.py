@@ -50,7 +50,13 @@ _CONSTANTS = {
 
 
 def report_page(report: PsfReport, provenance: dict[str, object]) -> Page:
-    """The page of a report. provenance: names and values, possibly nested, that describe software and request."""
+    """The page of a report.
+
+    Parameters
+    ----------
+    provenance
+        Names and values, possibly nested, that describe software and request.
+    """
     of = report.transit.instrument or "an unnamed instrument"
     inputs = inputs_of(report)
     return render(

@@ -288,7 +288,13 @@ def _figure(
     *,
     heights: tuple[float, ...] | None = None,
 ) -> tuple[Figure, list[Axes]]:
-    """A figure and its charts, row by row. heights: relative heights of the rows."""
+    """A figure and its charts, row by row.
+
+    Parameters
+    ----------
+    heights
+        Relative heights of the rows.
+    """
     figure = Figure(figsize=(width_in, height_in), dpi=PLOT_DPI, facecolor="white", layout="constrained")
     charts = figure.subplots(rows, across, squeeze=False, height_ratios=heights)
     return figure, list(np.ravel(charts))

@@ -81,10 +81,17 @@ class Missing:
 class PsfReport:
     """A transit, a PSF and all results about them.
 
-    tables: the tables of the PSF (`psfcore.tables.make`). fit, cross, study: None if the PSF was given; cross and study
-    can also be None for a reason that `missing` contains. held_out: whether every image was evaluated with a PSF that
-    was fitted without it. fitted_to_these: whether the PSF used in the evaluation was fitted to the same images, here
-    or according to its history.
+    Attributes
+    ----------
+    tables
+        The tables of the PSF (`psfcore.tables.make`).
+    fit, cross, study
+        The fit, its cross-validation and the study of dark offsets; None if the PSF was given. `cross` and `study` can
+        also be None for a reason that `missing` contains.
+    held_out
+        Whether every image was evaluated with a PSF that was fitted without it.
+    fitted_to_these
+        Whether the PSF used in the evaluation was fitted to the same images, here or according to its history.
     """
 
     transit: Transit
@@ -141,9 +148,16 @@ def make_report(
 ) -> PsfReport:
     """Fit a transit and evaluate the fit, or evaluate a given PSF.
 
-    dark_offsets: also fit with -5, -3, +3 and +5 DN added to every readout. seed: the seed of all random samples
-    (bootstrap, subsets of equations, noise realisations). solution: as in `fit_transit`; not used if the PSF is given.
     Raises DataError "plate-scale-mismatch", and the errors of `fit_transit` and `evaluate`.
+
+    Parameters
+    ----------
+    dark_offsets
+        Whether to fit also with -5, -3, +3 and +5 DN added to every readout.
+    seed
+        The seed of all random samples (bootstrap, subsets of equations, noise realisations).
+    solution
+        An existing solution, or a function that makes it, as for `fit_transit`; not used if the PSF is given.
     """
     missing = _MissingParts()
     fit: TransitFit | None = None
@@ -259,8 +273,12 @@ class _ReportProgress:
     def counted(self, name: str, visits: float) -> Progress:
         """The progress function of a stage with several fits.
 
-        The steps of each fit begin at 0 again. Therefore the calls are counted instead. visits: expected number of
-        calls.
+        The steps of each fit begin at 0 again. Therefore the calls are counted instead.
+
+        Parameters
+        ----------
+        visits
+            Expected number of calls.
         """
         calls = count(1)
         return lambda stage, _step, _steps: self._tell(name, stage, next(calls) / visits)
@@ -277,7 +295,13 @@ class _ReportProgress:
 
 
 def report_json(report: PsfReport, provenance: dict[str, object]) -> dict[str, Any]:
-    """All numbers of a report as JSON. provenance: the caller's description of software and request."""
+    """All numbers of a report as JSON.
+
+    Parameters
+    ----------
+    provenance
+        Description of software and request, from the caller.
+    """
     out: dict[str, object] = {
         "schema": SCHEMA,
         "sentence": report.sentence,

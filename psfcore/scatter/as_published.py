@@ -94,8 +94,8 @@ class Choices:
     Attributes
     ----------
     weighed_by_observed
-        Each equation is divided by its own noisy intensity; the fitted light in faint discs is then too low. Corrected:
-        each equation is divided by the noise expected at the disc's mean.
+        Each equation is divided by the noisy intensity of its pixel; the fitted light in faint discs is then too low.
+        Corrected: each equation is divided by the noise expected at the mean of the disc.
     added
         The scatter kernel is added to the diffraction PSF, Eq. (1). Corrected: kernel and diffraction PSF are
         convolved, so the ring sums are computed from the diffracted scene.
@@ -129,8 +129,13 @@ CORRECTED_ALONE = {
 class Equations:
     """The equations (1) of n pixels: observed, unscattered and scale (n,), and ring_sums (n, segments).
 
-    stratum: for an occulted pixel, the shell of the selection mask that contains it (0: outermost); for other pixels,
-    UNOCCULTED. scale: the number by which the equation is divided.
+    Attributes
+    ----------
+    stratum
+        For an occulted pixel, the shell of the selection mask that contains it (0: outermost); for other pixels,
+        UNOCCULTED.
+    scale
+        The number by which the equation is divided.
     """
 
     observed: Vector
@@ -153,9 +158,13 @@ class Equations:
 class SubsetFits:
     """Fits to subsets of equations; the worst fits are dropped.
 
-    fits: coefficients, (subsets kept, n): of the segments, or a, b (px) and c. mean: mean coefficients over the kept
-    subsets. For the power law, the mean is computed in coordinates with nearly Gaussian errors, because a varies by
-    powers of ten between subsets.
+    Attributes
+    ----------
+    fits
+        Coefficients (subsets kept, n) of the segments, or a, b (px) and c.
+    mean
+        Mean coefficients over the kept subsets. For the power law, the mean is computed in coordinates with nearly
+        Gaussian errors, because a varies by powers of ten between subsets.
     """
 
     fits: Matrix
@@ -189,13 +198,16 @@ def free_fit(
 ) -> SubsetFits:
     """The free fit of Eq. (2): coefficients, (subsets kept, segments), as fractions of the light per pixel.
 
-    towards: the coefficients that the prior favours; shells that no equation constrains keep these coefficients. The
-    prior is weak: if a shell doubles or vanishes, the misfit grows as much as if one equation were wrong by its scale.
-    Default: the prior favours zero for all shells, with PRIOR_WEIGHT.
-
     The paper has no prior. A prior is needed because no occulted pixel is close enough to the edge of the disc to
     separate the innermost shells from the centre. Without a prior, the fit assigns these shells more light than there
     is (a fraction of 1.3 in the first round on simulated transits).
+
+    Parameters
+    ----------
+    towards
+        The coefficients that the prior favours; shells that no equation constrains keep these coefficients. The prior
+        is weak: if a shell doubles or vanishes, the misfit grows as much as if one equation were wrong by its scale.
+        Default: the prior favours zero for all shells, with PRIOR_WEIGHT.
     """
     prior_at = np.zeros_like(counts) if towards is None else towards
     prior_weight = np.full_like(counts, PRIOR_WEIGHT)
@@ -223,7 +235,13 @@ def free_fit(
 def power_law_fit(
     equations: Equations, segments: Segments, start: Vector, *, seed: int, subsets: int = SUBSETS
 ) -> SubsetFits:
-    """The fit of Eq. (3): a, b (px) and c. start: the values of a, b and c at which the fit starts."""
+    """The fit of Eq. (3): a, b (px) and c.
+
+    Parameters
+    ----------
+    start
+        The values of a, b and c at which the fit starts.
+    """
     mean = _segment_mean(segments)
     a, b, c = start
     pivot_start = np.array([np.log(a) - c * np.log(b + PIVOT_PX), np.log(b), c])

@@ -87,10 +87,16 @@ class Curve:
 class ShellWeightFits:
     """Scatter fitted shell by shell, without a formula, to subsets of equations.
 
-    segments: the shells. weights: the weights per pixel from each subset, (subsets kept, shells). A shell that no
-    pixel constrains stays at the fitted shape, so the spread of its weights contains no information.
-    `psfcore.scatter.validation.free_shells` has another free fit: it fits deviations from the fitted shape to all
-    dark pixels, as one linear least-squares problem.
+    A shell that no pixel constrains stays at the fitted shape, so the spread of its weights contains no information.
+    `psfcore.scatter.validation.free_shells` has another free fit: it fits deviations from the fitted shape to all dark
+    pixels, as one linear least-squares problem.
+
+    Attributes
+    ----------
+    segments
+        The shells.
+    weights
+        The weights per pixel from each subset, (subsets kept, shells).
     """
 
     segments: Segments
@@ -170,10 +176,16 @@ def fit_transit(
     progress: Progress = lambda stage, step, steps: None,
     solution: Solution | Inverter | None = None,
 ) -> TransitFit:
-    """Fit a transit. as_published: also run the published recipe, and each correction of one bias alone.
+    """Fit a transit.
 
-    solution: an existing solution of this transit and shape, or a function that makes it; None: `invert` makes it.
     Raises DataError "unknown-shape", and the errors of `solution_of` and `invert`.
+
+    Parameters
+    ----------
+    as_published
+        Whether to run also the published recipe, and each correction of one bias alone.
+    solution
+        An existing solution of this transit and shape, or a function that makes it; None: `invert` makes it.
     """
     form = shape_named(shape)
     power_law = form is SOFTENED_POWER_LAW
@@ -384,7 +396,10 @@ def psf_of_fit(
 ) -> Psf:
     """A draft PSF with the fitted shape of a solution and the components DIFFRACTION and SCATTER.
 
-    covariance: of the coordinates.
+    Parameters
+    ----------
+    covariance
+        Covariance matrix of the coordinates.
     """
     transit, inversion = solution.transit, solution.inversion
     diffraction = crop_or_pad(transit.diffraction, kernel.shape[0])

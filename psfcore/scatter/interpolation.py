@@ -54,8 +54,12 @@ SAME_LIGHT = 1e-5
 class Epoch:
     """A fitted PSF and the time at which it holds.
 
-    psf: with its fitted shape and its component DIFFRACTION. origin: entries that name the PSF in the provenance of
-    an interpolated PSF, for example its id and the hash of its file.
+    Attributes
+    ----------
+    psf
+        The PSF, with its fitted shape and its component DIFFRACTION.
+    origin
+        Entries that name the PSF in the provenance of an interpolated PSF, for example its id and the hash of its file.
     """
 
     psf: Psf
@@ -85,9 +89,14 @@ def weight_at(before: datetime, after: datetime, time: datetime) -> float:
 
 
 def interpolated_shape(before: FittedShape, after: FittedShape, weight: float) -> FittedShape:
-    """The fitted shape between two fits, Eq. (2) and (3). weight: that of ``after``, 0 to 1.
+    """The fitted shape between two fits, Eq. (2) and (3).
 
     Raises DataError "shapes-differ" if the two fits do not have the same shape and parameters.
+
+    Parameters
+    ----------
+    weight
+        The weight of ``after``, 0 to 1.
     """
     if (before.shape, before.parameters) != (after.shape, after.parameters):
         raise DataError(

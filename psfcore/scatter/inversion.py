@@ -135,7 +135,12 @@ def solution_at(
 ) -> Solution:
     """The scenes, occulters, residuals and errors of a transit with the PSF at these coordinates, without any fit.
 
-    total: of the shape of scatter. Raises the errors of `invert`.
+    Raises the errors of `invert`.
+
+    Parameters
+    ----------
+    total
+        Computation of total PSFs for the shape of the scatter.
     """
     sky = _scenes(transit, total, at, threads, progress)
     return _Solver(sky, total, [1] * len(transit.frames), threads, progress).solution(at)
@@ -187,10 +192,17 @@ def refit(
 ) -> tuple[Reconstruction, Vector]:
     """Repeat the fit of a solution with other counts, without errors; returns the coordinates too.
 
-    counts: how many times each image counts (see `invert`). start: coordinates near the expected result, for example
-    one Gauss-Newton step from the solution. The iteration starts from the scenes of the solution; the scenes of images
-    outside the fit stay those of the solution. Every occulter is located again with the PSF at the coordinates `start`.
+    The iteration starts from the scenes of the solution; the scenes of images outside the fit stay those of the
+    solution. Every occulter is located again with the PSF at the coordinates `start`.
+
     Raises the errors of `invert`.
+
+    Parameters
+    ----------
+    counts
+        How many times each image counts (see `invert`).
+    start
+        Coordinates near the expected result, for example one Gauss-Newton step from the solution.
     """
     total, threads, shape = solution.total, solution.threads, solution.transit.shape
     sky, kernel = solution.sky.copy(), total.kernel(start)
@@ -205,8 +217,12 @@ def refit(
 class _Measured:
     """One image compared with the model: residual and expected intensity of its dark pixels, and their Jacobian.
 
-    weight, weighted, normal: the weights of the pixels, the weighted Jacobian, and its normal matrix. They are reused
-    while the PSF hardly changes.
+    The other fields are reused while the PSF hardly changes.
+
+    Attributes
+    ----------
+    weight, weighted, normal
+        The weights of the pixels, the weighted Jacobian, and the normal matrix of this Jacobian.
     """
 
     residual: Vector
@@ -325,7 +341,13 @@ class _Solver:
         return np.asarray(normal)
 
     def reconstruction(self, kernel: Kernel, frames: list[int]) -> Reconstruction:
-        """The scenes with this total PSF. frames: the images of the fit."""
+        """The scenes with this total PSF.
+
+        Parameters
+        ----------
+        frames
+            The images of the fit.
+        """
         transit, threads = self._sky.transit, self._threads
         optics = Optics(kernel, transit.shape, threads=threads)
         return Reconstruction(transit, self._total, optics, self._sky, tuple(frames), threads)

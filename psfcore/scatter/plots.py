@@ -233,7 +233,11 @@ def cross_validation_png(
     """Write a PNG with C(R), the totals of all fits, and the residuals of held-out images; bands of 1 and 2 sigma.
 
     If there is a free fit, an upper row of panels compares it with the formula: weights, diffuse light and excess.
-    fov_of: the pointing of each image.
+
+    Parameters
+    ----------
+    fov_of
+        The pointing of each image.
     """
     rows = 1 if bands.shells is None else 2
     figure = Figure(figsize=(15.6, 4.9 * rows), dpi=100, facecolor="white", layout="constrained")

@@ -175,8 +175,16 @@ def dark_pixels(frame: Frame, found: FoundPlace) -> Pixels:
 class Reconstruction:
     """A transit reconstructed with one PSF: its scenes, its dark pixels, and the residuals there.
 
-    total: computes total PSFs. optics: convolution with the fitted total PSF. sky: scenes and dark pixels of all
-    images. part: indices of the images to which the PSF was fitted.
+    Attributes
+    ----------
+    total
+        Computation of total PSFs from coordinates.
+    optics
+        Convolution with the fitted total PSF.
+    sky
+        Scenes and dark pixels of all images.
+    part
+        Indices of the images to which the PSF was fitted.
     """
 
     transit: Transit
@@ -215,8 +223,12 @@ class Reconstruction:
         return np.asarray(1 / self.transit.noise.variance(level, self.transit.frames[n].exposure_s))
 
     def jacobian(self, n: int, slope: Blur) -> Vector:
-        """The derivative of the expected light in the dark pixels of image n, from Eq. (4). slope: derivative of the
-        total PSF.
+        """The derivative of the expected light in the dark pixels of image n, from Eq. (4).
+
+        Parameters
+        ----------
+        slope
+            Derivative of the total PSF.
         """
         dark = self.sky.dark[n]
         changed = slope.convolve(self.blanked_scene(n))
@@ -227,7 +239,15 @@ class Reconstruction:
 
 @dataclass(frozen=True)
 class Round:
-    """One Gauss-Newton step. frames: number of images. moved_points: largest change of C(R), in percentage points."""
+    """One Gauss-Newton step.
+
+    Attributes
+    ----------
+    frames
+        Number of images.
+    moved_points
+        Largest change of C(R), in percentage points.
+    """
 
     frames: int
     values: dict[str, float]
@@ -240,9 +260,16 @@ class Round:
 class FrameFit:
     """The fit of one image: the position of its occulter, and the observed and expected light in the disc.
 
-    observed, expected: means over the fully dark pixels, DN/s. noise: standard error of the mean residual, DN/s.
-    normal, score: matrix and right-hand side that this image adds to the normal equations of the coordinates.
-    mean_jacobian: derivatives of `expected` with respect to the coordinates, DN/s.
+    Attributes
+    ----------
+    observed, expected
+        Means over the fully dark pixels, DN/s.
+    noise
+        Standard error of the mean residual, DN/s.
+    normal, score
+        Matrix and right-hand side that this image adds to the normal equations of the coordinates.
+    mean_jacobian
+        Derivatives of `expected` with respect to the coordinates, DN/s.
     """
 
     file: str
@@ -267,10 +294,16 @@ class FrameFit:
 class Inversion:
     """The scatter that was fitted to a transit: coordinates with their covariance, and the curve C(R) with its errors.
 
-    curve_pct, curve_sigma: C(R) = 100 (1 - encircled energy) of the total PSF at radii_px, and its standard error. The
-    radii lie within the array of TotalPsf. covariance: covariance matrix of the coordinates; it follows from the photon
-    and read noise of all pixels, propagated through the whole fit. left_out: files that the fit did not use, with the
-    reasons.
+    Attributes
+    ----------
+    curve_pct, curve_sigma
+        The curve C(R) = 100 (1 - encircled energy) of the total PSF at radii_px, and its standard error. The radii lie
+        within the array of TotalPsf.
+    covariance
+        Covariance matrix of the coordinates; it follows from the photon and read noise of all pixels, propagated
+        through the whole fit.
+    left_out
+        Files that the fit did not use, with the reasons.
     """
 
     shape: Shape

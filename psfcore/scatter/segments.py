@@ -87,10 +87,15 @@ class Runs(NamedTuple):
 
 @dataclass(frozen=True)
 class Segments:
-    """Concentric shells.
+    """Concentric shells of pixels of the reach grid.
 
-    edges_px: edges of the shells, two or more, increasing from above 0. Only pixels of the reach grid count. The shape
-    of this grid is (reach_grid_px, reach_grid_px), and its centre is at [n // 2, n // 2].
+    Attributes
+    ----------
+    edges_px
+        Edges of the shells, two or more, increasing from above 0.
+    reach_grid_px
+        Edge of the reach grid. The shape of this grid is (reach_grid_px, reach_grid_px), and its centre is at [n // 2,
+        n // 2].
     """
 
     edges_px: tuple[float, ...]
@@ -157,7 +162,10 @@ class Segments:
 def beyond_pct(light: Floats) -> Floats:
     """The percentage of all light that lies beyond the inner edge of each segment.
 
-    light: the light in each segment, as a fraction of all light, (fits, segments).
+    Parameters
+    ----------
+    light
+        The light in each segment, as a fraction of all light, (fits, segments).
     """
     return np.asarray(100 * np.cumsum(light[:, ::-1], axis=1)[:, ::-1])
 
@@ -169,9 +177,16 @@ def segment_sums(
 
     The sums are in the image's unit times px^2, exact to float64 rounding.
 
-    image: [y, x], float32 or float64; it is taken as 0 beyond its edges. targets: (n, 2), the (y, x) of each target on
-    the image, in any order. threads: number of threads that share the targets; it does not change the result. Raises
-    DataError "image-nonfinite" if a pixel is NaN or infinite, and ValueError if a target lies outside the image.
+    Raises DataError "image-nonfinite" if a pixel is NaN or infinite, and ValueError if a target lies outside the image.
+
+    Parameters
+    ----------
+    image
+        Pixels [y, x], float32 or float64; the image counts as 0 beyond its edges.
+    targets
+        The (y, x) of each target on the image, (n, 2), in any order.
+    threads
+        Number of threads that share the targets; it does not change the result.
     """
     if not ((targets >= 0) & (targets < image.shape)).all():
         raise ValueError(f"expected targets (y, x) inside the image of {image.shape}; got one outside it")

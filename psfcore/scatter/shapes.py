@@ -57,8 +57,14 @@ CORE_PX = 1.5
 class Parameter:
     """A parameter of a shape.
 
-    start: the value at which a fit starts. scale: the function that turns a value into the unbounded coordinate.
-    largest_step: the largest change of the coordinate in one round of the fit.
+    Attributes
+    ----------
+    start
+        The value at which a fit starts.
+    scale
+        The function that turns a value into the unbounded coordinate.
+    largest_step
+        The largest change of the coordinate in one round of the fit.
     """
 
     name: str
@@ -127,7 +133,13 @@ class Shape:
         return {p.name: p.value(float(q)) for p, q in zip(self.parameters, coordinates, strict=True)}
 
     def value_sigma(self, coordinates: Vector, covariance: Matrix) -> dict[str, float]:
-        """Standard errors of the parameters by name. covariance: that of the coordinates."""
+        """Standard errors of the parameters by name.
+
+        Parameters
+        ----------
+        covariance
+            Covariance matrix of the coordinates.
+        """
         return {
             p.name: abs(p.slope(float(q))) * float(sigma)
             for p, q, sigma in zip(self.parameters, coordinates, np.sqrt(np.diag(covariance)), strict=True)

@@ -43,7 +43,15 @@ _ARRAYS_OF_FRAMES = ("normal", "score", "mean_jacobian")
 
 @dataclass(frozen=True)
 class _Contents:
-    """What is no array. found: one entry for each frame of the transit. part: the indices of the fitted frames."""
+    """The values of a stored solution that are not arrays.
+
+    Attributes
+    ----------
+    found
+        The place of the occulter in each frame of the transit.
+    part
+        The indices of the fitted frames.
+    """
 
     version: Literal[1]
     shape: str
@@ -91,10 +99,15 @@ def write_solution(path: Path, solution: Solution) -> None:
 
 
 def read_solution(path: Path, transit: Transit, *, threads: int = 1) -> Solution:
-    """Read a solution from a file. transit: the transit from which the solution was made.
+    """Read a solution from a file.
 
     Raises OSError, and DataError "bad-solution" if the file is damaged, has an unknown version, or belongs to another
     transit.
+
+    Parameters
+    ----------
+    transit
+        The transit from which the solution was made.
     """
     try:
         with path.open("rb") as file, NpzFile(file, allow_pickle=False) as archive:

@@ -74,7 +74,13 @@ class TotalPsf:
     """Computes total PSFs that share one diffraction PSF.
 
     The total PSFs lie on a square whose edge is twice the longer edge of the field, at most the edge of the full reach.
-    diffraction: weights [y, x], sum 1 on its own grid. field_shape: (ny, nx) of the images.
+
+    Parameters
+    ----------
+    diffraction
+        Weights [y, x] of the diffraction PSF, sum 1 on their own grid.
+    field_shape
+        Shape (ny, nx) of the images.
     """
 
     def __init__(
@@ -113,7 +119,12 @@ class TotalPsf:
 def curve_sigma(slopes: Iterable[Kernel], covariance: Matrix, radii_px: Vector) -> Vector:
     """The standard error of C(R) = 100 (1 - encircled energy) of a kernel, in percent, one for each radius (px).
 
-    slopes: the derivatives of the kernel with respect to the coordinates. covariance: that of the coordinates.
+    Parameters
+    ----------
+    slopes
+        The derivatives of the kernel with respect to the coordinates.
+    covariance
+        Covariance matrix of the coordinates.
     """
     of_curve = np.stack([-100 * encircled_energy(slope, radii_px) for slope in slopes], axis=1)
     variance = np.einsum("rk,kl,rl->r", of_curve, covariance, of_curve)
@@ -161,8 +172,12 @@ def possible_on_pixels(psf: Psf, header: Header, *, threads: int = 1) -> list[Ps
 class Blur:
     """Convolution with a kernel on one field, in float32; the result is cropped to the field.
 
-    kernel: [y, x], centre at [n // 2, n // 2]; its values may have any sign. The scene is assumed dark beyond the edges
-    of the field.
+    The scene is assumed dark beyond the edges of the field.
+
+    Parameters
+    ----------
+    kernel
+        Values [y, x] of any sign, centre at [n // 2, n // 2].
     """
 
     def __init__(self, kernel: Kernel, field_shape: tuple[int, int], *, threads: int = 1) -> None:
@@ -228,8 +243,12 @@ class Optics(Blur):
         return self._through(lanes, self._inverse, conjugate=adjoint)
 
     def invert(self, observed: Lanes, start: Lanes | None = None, *, steps: int = STEPS) -> Lanes:
-        """The scene x of an observation, from `steps` iterations of Eq. (1). start: first estimate (default:
-        observed).
+        """The scene x of an observation, from `steps` iterations of Eq. (1).
+
+        Parameters
+        ----------
+        start
+            First estimate; default: the observation.
         """
         first = observed if start is None else start
         return solve_linear(self.engine, self._inverse, observed, first, steps)  # Eq. (1)

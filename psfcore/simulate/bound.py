@@ -73,9 +73,18 @@ class CurveBound:
 class PhotonBound:
     """The smallest standard errors that photon noise and read noise allow.
 
-    b_px, c, total, a: errors of the parameters of the power law, fitted together. covariance: covariance matrix of b, c
-    and total. stretch: error of the stretch along stretch_angle_deg, fitted together with b, c and total. places_px:
-    errors of the occulter's x and y in each image. dark_pixels: number of fully dark pixels in all images.
+    Attributes
+    ----------
+    b_px, c, total, a
+        Errors of the parameters of the power law, fitted together.
+    covariance
+        Covariance matrix of b, c and total.
+    stretch
+        Error of the stretch along stretch_angle_deg, fitted together with b, c and total.
+    places_px
+        Errors of x and y of the occulter in each image, px.
+    dark_pixels
+        Number of fully dark pixels in all images.
     """
 
     images: int

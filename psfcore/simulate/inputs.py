@@ -50,10 +50,14 @@ _INTERVAL_S = 60.0  # time between two images, if their times are not stated
 
 @dataclass(frozen=True)
 class PlanFile:
-    """The content of a plan file. known_psf: the file with the known part of the PSF. instrument: the name of the
-    instrument.
+    """The content of a plan file.
 
-    Both are None if the plan file does not state them.
+    Attributes
+    ----------
+    known_psf
+        The file with the known part of the PSF; None: the plan file does not state it.
+    instrument
+        The name of the instrument; None: the plan file does not state it.
     """
 
     plan: Plan

@@ -183,7 +183,10 @@ def drawn_oversampling(size_px: int) -> int:
 class _Track:
     """Where the occulter starts and ends in a pointing: (x, y) divided by the edge of the field.
 
-    start_min, end_min: the times of both points, in minutes after 03:42 UT.
+    Attributes
+    ----------
+    start_min, end_min
+        The times of both points, in minutes after 03:42 UT.
     """
 
     start: tuple[float, float]

@@ -72,8 +72,12 @@ def total_kernel(
 ) -> Kernel:
     """The total PSF: the scatter kernel convolved with the diffraction PSF, on (size, size).
 
-    The convolution is linear, and its result is not renormalised. diffraction: weights [y, x], centre at
-    [n // 2, n // 2], sum 1.
+    The convolution is linear, and its result is not renormalised.
+
+    Parameters
+    ----------
+    diffraction
+        The diffraction PSF: weights [y, x], centre at [n // 2, n // 2], sum 1.
     """
     return convolved(anisotropic_kernel(scatter, REACH_GRID_PX), diffraction, size, threads=threads)
 

@@ -51,8 +51,18 @@ class _Region:
 class _Bundle:
     """Parallel loops. All lengths are in field edges.
 
-    x, y: middle between the footpoints. span: half the distance between the footpoints. rise: height. lean: tilt in
-    radians. light: brightness relative to the region's moss.
+    Attributes
+    ----------
+    x, y
+        Position of the middle between the footpoints.
+    span
+        Half the distance between the footpoints.
+    rise
+        Height of the loops.
+    lean
+        Tilt of the loops, radians.
+    light
+        Brightness relative to the moss of the region.
     """
 
     x: float
@@ -135,7 +145,12 @@ def solar_scene(
 ) -> Plane:
     """True intensities [y, x] in DN/s, positive. Equal arguments give equal scenes.
 
-    shape: (ny, nx) of the field. The result is margin_px larger on each side; the Sun continues beyond the field.
+    The result is margin_px larger than the field on each side; the Sun continues beyond the field.
+
+    Parameters
+    ----------
+    shape
+        Shape (ny, nx) of the field.
     """
     rng = np.random.default_rng(seed)
     canvas = _Canvas((shape[0] + 2 * margin_px, shape[1] + 2 * margin_px), max(shape), margin_px)
@@ -198,7 +213,12 @@ def _octaves(canvas: _Canvas, rng: np.random.Generator, *, slope: float, coarses
     """Gaussian noise with structure on many scales: mean 0, rms 1.
 
     The noise is a sum of smooth random planes. Each plane has half the scale of the previous one, down to one pixel.
-    The amplitude of a plane is proportional to its scale to the power `slope`. coarsest: largest scale, in field edges.
+    The amplitude of a plane is proportional to its scale to the power `slope`.
+
+    Parameters
+    ----------
+    coarsest
+        Largest scale, in field edges.
     """
     shape, edge = canvas.shape, canvas.edge
     total = np.zeros(shape)

@@ -50,10 +50,17 @@ _ROUNDING = 1e-11  # rounding error of a share, which is a difference of areas o
 class TrueSky:
     """Scenes, occulter and PSF of a transit; all planes float64 [y, x] in DN/s on detector pixels.
 
-    diffraction, kernel: weights [y, x], centre at [n // 2, n // 2]. kernel is the total PSF on twice the edge of the
-    scenes, at most the full reach. scenes: the scene of each pointing, plan.margin_px larger than the field on each
-    side. seen_scenes: the scene of each pointing without the occulter, convolved with the PSF, on the field. behind:
-    for each image, the patch of the scene around the occulter.
+    Attributes
+    ----------
+    diffraction, kernel
+        Weights [y, x] of the diffraction PSF and of the total PSF, centre at [n // 2, n // 2]. The array of the total
+        PSF has twice the edge of the scenes, at most the full reach.
+    scenes
+        The scene of each pointing, plan.margin_px larger than the field on each side.
+    seen_scenes
+        The scene of each pointing without the occulter, convolved with the PSF, on the field.
+    behind
+        For each image, the patch of the scene around the occulter.
     """
 
     plan: Plan
@@ -91,8 +98,14 @@ def true_sky(
 ) -> TrueSky:
     """The sky of a plan. Without `scenes`, the scenes are synthetic and follow from `seed`.
 
-    scenes: a scene for each pointing, in the form that scene_from_image returns. diffraction: weights [y, x], centre at
-    [n // 2, n // 2], sum 1. Raises DataError "bad-diffraction", "bad-scene".
+    Raises DataError "bad-diffraction", "bad-scene".
+
+    Parameters
+    ----------
+    scenes
+        A scene for each pointing, in the form that scene_from_image returns.
+    diffraction
+        The diffraction PSF: weights [y, x], centre at [n // 2, n // 2], sum 1.
     """
     _check_diffraction(diffraction)
     whole_px = plan.size_px + 2 * plan.margin_px
@@ -162,9 +175,15 @@ def _check_diffraction(diffraction: Kernel) -> None:
 def covered_share(place: Place, first: tuple[int, int], shape: tuple[int, int], fine: int = 1) -> Plane:
     """The share (0 to 1) of each fine pixel that is behind the disc, Eq. (2); array of (fine * ny, fine * nx).
 
-    Each detector pixel is divided into `fine` fine pixels along each axis. first: (row, column) of the first detector
-    pixel. shape: (ny, nx), the number of detector pixels. The shares are exact except for rounding. A pixel entirely
-    inside the disc gets exactly 1, a pixel entirely outside exactly 0.
+    Each detector pixel is divided into `fine` fine pixels along each axis. The shares are exact except for rounding. A
+    pixel entirely inside the disc gets exactly 1, a pixel entirely outside exactly 0.
+
+    Parameters
+    ----------
+    first
+        Position (row, column) of the first detector pixel.
+    shape
+        Numbers (ny, nx) of detector pixels.
     """
     y = first[0] - 0.5 + np.arange(fine * shape[0] + 1) / fine - place.y_px
     x = first[1] - 0.5 + np.arange(fine * shape[1] + 1) / fine - place.x_px
@@ -193,7 +212,13 @@ def _half_segment(x: Plane, r: float) -> Plane:
 
 
 def fully_dark(place: Place, first: tuple[int, int], shape: tuple[int, int]) -> Flags:
-    """True for pixels [y, x] whose four corners all lie inside the disc. first, shape: see covered_share."""
+    """True for pixels [y, x] whose four corners all lie inside the disc.
+
+    Parameters
+    ----------
+    first, shape
+        Position of the first pixel and number of pixels, see `covered_share`.
+    """
     y = np.abs(first[0] + np.arange(shape[0]) - place.y_px) + 0.5
     x = np.abs(first[1] + np.arange(shape[1]) - place.x_px) + 0.5
     return np.asarray(np.hypot(x[None, :], y[:, None]) <= place.radius_px)
@@ -203,8 +228,12 @@ def fully_dark(place: Place, first: tuple[int, int], shape: tuple[int, int]) -> 
 class Behind:
     """A patch of the scene around one position of the disc: fine pixels [y, x] in DN/s.
 
-    first: (row, column) in the field of the first detector pixel of the patch. fine: number of fine pixels in a
-    detector pixel along each axis.
+    Attributes
+    ----------
+    first
+        Position (row, column) in the field of the first detector pixel of the patch.
+    fine
+        Number of fine pixels in a detector pixel along each axis.
     """
 
     first: tuple[int, int]
@@ -241,8 +270,12 @@ class Behind:
 def behind(fine_scene: Plane, place: Place, *, fine: int, margin_px: int) -> Behind:
     """The patch of a scene that the disc can hide when its centre lies less than a pixel from `place`.
 
-    fine_scene: fine pixels [y, x], DN/s; it extends margin_px detector pixels beyond the field on each side.
-    fine: number of fine pixels in a detector pixel along each axis.
+    Parameters
+    ----------
+    fine_scene
+        The scene in fine pixels [y, x], DN/s; it extends margin_px detector pixels beyond the field on each side.
+    fine
+        Number of fine pixels in a detector pixel along each axis.
     """
     reach = place.radius_px + 2
     field = (fine_scene.shape[0] // fine - 2 * margin_px, fine_scene.shape[1] // fine - 2 * margin_px)

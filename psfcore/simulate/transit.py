@@ -154,9 +154,17 @@ def _commented(values: dict[str, CardValue]) -> dict[str, tuple[CardValue, str]]
 class SimulatedTransit:
     """A simulated transit in memory, with the true values.
 
-    transit: frames in DN/s (float32), made from whole DN. The frames' places are the reported positions, which contain
-    the errors of the ephemeris. sky: the true scenes, PSF and positions. seed: of the noise and of the errors of the
-    ephemeris. imitated: the instrument whose keywords the headers get.
+    Attributes
+    ----------
+    transit
+        The transit, with frames in DN/s (float32) that are made from whole DN. The places of the frames are the
+        reported positions, which contain the errors of the ephemeris.
+    sky
+        The true scenes, PSF and positions.
+    seed
+        Seed of the noise and of the errors of the ephemeris.
+    imitated
+        The instrument whose keywords the headers get.
     """
 
     transit: Transit
@@ -182,10 +190,19 @@ def simulate(
 ) -> SimulatedTransit:
     """A transit of `plan`. Its PSF is `scatter` convolved with `diffraction`. Equal arguments give equal results.
 
-    diffraction: weights [y, x], centre at [n // 2, n // 2], sum 1. seed: random seed of the scenes, the ephemeris
-    errors and the noise. scenes: for each pointing, a scene to use instead of a synthetic scene, as drawn_scene and
-    scene_from_image of psfcore.simulate.scene return it. imitated: the instrument whose keywords the headers get.
     Raises DataError "bad-diffraction", "bad-scene".
+
+    Parameters
+    ----------
+    diffraction
+        The diffraction PSF: weights [y, x], centre at [n // 2, n // 2], sum 1.
+    seed
+        Random seed of the scenes, the ephemeris errors and the noise.
+    scenes
+        For each pointing, a scene to use instead of a synthetic scene, as drawn_scene and scene_from_image of
+        psfcore.simulate.scene return it.
+    imitated
+        The instrument whose keywords the headers get.
     """
     sky = true_sky(plan, scatter, diffraction, seed, scenes=scenes, threads=threads)
     return observed_transit(sky, seed, imitated)
@@ -290,7 +307,12 @@ def write_observation(
 ) -> None:
     """Write the files that a real transit also has: images, diffraction PSF and transit.json.
 
-    exposures: [y, x] in DN, in the order of the plan. places: the reported positions of the occulter.
+    Parameters
+    ----------
+    exposures
+        The images [y, x] in DN, in the order of the plan.
+    places
+        The reported positions of the occulter.
     """
     folder.mkdir(parents=True, exist_ok=True)
     entries = []

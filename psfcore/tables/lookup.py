@@ -38,7 +38,13 @@ Numbers = list[float]
 
 
 class Profile(TypedDict):
-    """Mean weights, by ring of one pixel. sigma: of the total PSF and its scatter; {} if not fitted."""
+    """Mean weights, by ring of one pixel.
+
+    Attributes
+    ----------
+    sigma
+        The standard errors of the total PSF and of its scatter; {} if the scatter was not fitted.
+    """
 
     radius_px: Numbers
     pixels: list[int]

@@ -26,9 +26,17 @@ _WHERE = (
 class ArchiveLimits:
     """Limits for the number and the sizes of the files in an archive.
 
-    max_files: members of any kind, including hidden files. max_bytes: unpacked bytes of all members.
-    max_member_bytes: unpacked bytes of one member. max_ratio: unpacked bytes divided by the bytes of the archive. This
-    bound applies only above RATIO_FLOOR_BYTES.
+    Attributes
+    ----------
+    max_files
+        Largest number of members of any kind, including hidden files.
+    max_bytes
+        Largest number of unpacked bytes of all members.
+    max_member_bytes
+        Largest number of unpacked bytes of one member.
+    max_ratio
+        Largest ratio of the unpacked bytes to the bytes of the archive. This bound applies only above
+        RATIO_FLOOR_BYTES.
     """
 
     max_files: int = 16_384

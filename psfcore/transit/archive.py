@@ -55,8 +55,12 @@ class ArchiveContents:
 
 @dataclass(frozen=True)
 class FolderTransit:
-    """A folder with a transit that is not packed. sha256, bytes: hash and size of the .tar file that ``pack`` would
-    write.
+    """A folder with a transit that is not packed.
+
+    Attributes
+    ----------
+    sha256, bytes
+        Hash and size of the .tar file that ``pack`` would write.
     """
 
     folder: Path
@@ -131,8 +135,12 @@ def _files_in(
 ) -> Iterator[tuple[Kind, list[Copied], BinaryIO]]:
     """The kind of an archive, its files in their order, and the file with their plain bytes.
 
-    scratch: the folder of a temporary file. start_bytes: the number of bytes that are needed of each file
-    (``copy_files``).
+    Parameters
+    ----------
+    scratch
+        The folder of a temporary file.
+    start_bytes
+        The number of bytes that are needed of each file (``copy_files``).
     """
     with path.open("rb") as archive, TemporaryFile(dir=scratch) as temporary:
         content = cast(BinaryIO, temporary)

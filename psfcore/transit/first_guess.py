@@ -48,8 +48,13 @@ Flat = NDArray[np.float64]
 class FrameGuess:
     """The first guess from one image. Intensities are in DN/s; a value that cannot be computed is NaN.
 
-    characteristic_dn_s and ratio have one value for each estimator. inhomogeneity: infinite if the centre of the disc
-    is not in the image, or if one of the estimators is not above 0.
+    Attributes
+    ----------
+    characteristic_dn_s
+        The characteristic intensity by each estimator; `ratio` also has one value for each estimator.
+    inhomogeneity
+        Inhomogeneity of the image; infinite if the centre of the disc is not in the image, or if one of the estimators
+        is not above 0.
     """
 
     file: str
@@ -73,7 +78,10 @@ class PointingGuess:
     """The first guess from one pointing: mean and standard deviation (scatter) of the ratio over its images, by
     estimator.
 
-    inhomogeneity: the median over the images of the pointing.
+    Attributes
+    ----------
+    inhomogeneity
+        The median inhomogeneity of the images of the pointing.
     """
 
     pointing: int
@@ -85,11 +93,17 @@ class PointingGuess:
 
 @dataclass(frozen=True)
 class FirstGuess:
-    """The first guess from all images, in the order of time, and from all pointings.
+    """The first guess from all images, in the order of time, and from all pointings. The ratio is 1 - encircled energy
+    at radius_px, as a fraction.
 
-    best_pointing: the most homogeneous pointing. share, share_spread: mean and standard deviation of the ratios of all
-    images of this pointing and all three estimators. radius_px: the mean radius of the disc in these images. The ratio
-    is 1 - encircled energy at radius_px, as a fraction.
+    Attributes
+    ----------
+    best_pointing
+        The most homogeneous pointing.
+    share, share_spread
+        Mean and standard deviation of the ratios of all images of this pointing and all three estimators.
+    radius_px
+        The mean radius of the disc in these images.
     """
 
     frames: tuple[FrameGuess, ...]

@@ -65,16 +65,25 @@ def read_prepared(
     """Read the transit in a folder, in DN/s, with frames in time order; also return the counts of saturated and filled
     pixels.
 
-    progress(done, of) is called after each image. diffraction: weights [y, x], or a function of (name of the instrument
-    or None, shape of the images) that returns them; used if transit.json has no known_psf. noise: replaces the noise
-    figures of transit.json. saturation_dn: saturation level of one exposure in DN; default: as in
-    `psfcore.fits.observation.read_observation`. Times come from DATE-BEG or
-    DATE-OBS. If one image has neither, all images keep the order of transit.json, with one second between them.
+    Times come from DATE-BEG or DATE-OBS. If one image has neither, all images keep the order of transit.json, with one
+    second between them.
 
     Raises DataError: "transit-shapes", "occulter-outside", "occulter-too-large", "no-noise-figures", "no-known-psf",
     "known-psf-..." (see ``checked_kernel``), the errors of ``checked_folder``, the errors of ``read_observation`` with
     the name of the file, and the errors of ``prepare``. Raises HeaderError for faults of a header. If several images
     have faults, one error names all of them.
+
+    Parameters
+    ----------
+    progress
+        Function progress(done, of) that is called after each image.
+    diffraction
+        Weights [y, x], or a function of (name of the instrument or None, shape of the images) that returns them; used
+        if transit.json has no known_psf.
+    noise
+        Noise of the camera in place of the noise figures of transit.json.
+    saturation_dn
+        Saturation level of one exposure in DN; default: as in `psfcore.fits.observation.read_observation`.
     """
     folder = Path(folder)
     manifest = checked_folder(folder).manifest
@@ -218,9 +227,15 @@ def _known_psf(
 def checked_kernel(kernel: Kernel, label: str) -> Kernel:
     """Check the known part of a PSF [y, x], centre at [ny // 2, nx // 2], and normalise it to sum 1.
 
-    A sum that differs from 1 by at most KNOWN_PSF_SUM_TOLERANCE counts as rounding. label: the name of the PSF in
-    errors. Raises DataError "known-psf-small", "known-psf-nonfinite", "known-psf-negative", "known-psf-sum",
+    A sum that differs from 1 by at most KNOWN_PSF_SUM_TOLERANCE counts as rounding.
+
+    Raises DataError "known-psf-small", "known-psf-nonfinite", "known-psf-negative", "known-psf-sum",
     "known-psf-not-centred".
+
+    Parameters
+    ----------
+    label
+        The name of the PSF in errors.
     """
     if kernel.ndim != 2 or min(kernel.shape) < SMALLEST_KNOWN_PSF_PX:
         message = f"expected at least {SMALLEST_KNOWN_PSF_PX} px on each side"

@@ -72,7 +72,11 @@ def archive_kind(start: bytes) -> Literal["zip", "tar", "gzip"] | None:
 class Copied(NamedTuple):
     """A file of an archive, and where its bytes are: ``length`` bytes from position ``at`` of the target of
     ``copy_files``, or of the archive itself if whole files of a .tar were asked for, which holds plain bytes.
-    size_bytes: the declared size.
+
+    Attributes
+    ----------
+    size_bytes
+        The declared size of the file.
     """
 
     name: str
@@ -85,8 +89,13 @@ class Copied(NamedTuple):
 class _Entry:
     """A member of an archive.
 
-    fault: why it is not a plain file; empty if it is one. at: the position of its plain bytes in a .tar; None in other
-    archives, where ``open`` gives them.
+    Attributes
+    ----------
+    fault
+        The reason why the member is not a plain file; empty: it is a plain file.
+    at
+        The position of the plain bytes of the member in a .tar; None in other archives, where ``open`` gives these
+        bytes.
     """
 
     name: str
@@ -105,20 +114,20 @@ def copy_files(
     Returns "kind", and "files" with the values of a ``Copied`` for each file. Files of folders beside the transit are
     checked too; their bytes in ``target`` mean nothing.
 
+    Raises DataError "not-an-archive", "archive-climbs", "archive-not-plain", "archive-too-large", "archive-broken". An
+    OSError of the disk is raised unchanged.
+
     Parameters
     ----------
     target
-        An open file.
+        The open file to which the bytes are written.
     path
-        The archive.
+        The file of the archive.
     limits
         The values of ``ArchiveLimits``.
     start_bytes
         How many bytes to copy of the start of each file, see `plain_start`; None: all bytes. Of transit.json,
         MAX_MANIFEST_BYTES and one more are copied.
-
-    Raises DataError "not-an-archive", "archive-climbs", "archive-not-plain", "archive-too-large", "archive-broken".
-    An OSError of the disk is raised unchanged.
     """
     gate = Gate(ArchiveLimits(**limits))
     found: list[tuple[Admitted, Copied]] = []
@@ -160,8 +169,14 @@ def plain_start(file: IO[bytes], count: int) -> bytes:
 
 
 def copy_bytes(source: IO[bytes], target: IO[bytes], count: int, name: str) -> None:
-    """Copy the next bytes of an open file. name: for the error. Raises DataError "archive-broken" if there are
-    fewer.
+    """Copy the next bytes of an open file.
+
+    Raises DataError "archive-broken" if there are fewer.
+
+    Parameters
+    ----------
+    name
+        Name of the file, for the error.
     """
     while count and (piece := source.read(min(count, _PIECE_BYTES))):
         target.write(piece)

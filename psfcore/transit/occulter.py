@@ -79,7 +79,7 @@ class FoundPlace:
     depth
         The missing light divided by the light that a disc would hide; 1 with an occulter, 0 without an occulter.
     depth_sigma
-        The error of depth.
+        The error of `depth`.
     within_reach
         Whether the position is near enough to the ephemeris.
     """
@@ -185,8 +185,14 @@ def find_occulter(
 ) -> FoundPlace:
     """Find the position of the occulter in frame `index`.
 
-    scene_of: the deconvolved frame [y, x] of an index, DN/s. places: the best known positions of the occulter in all
-    frames; they decide which frames are neighbours. psf_kernel: weights [y, x], centre at [n // 2, n // 2].
+    Parameters
+    ----------
+    scene_of
+        Function of the index of a frame that returns the deconvolved frame [y, x], DN/s.
+    places
+        The best known positions of the occulter in all frames; they decide which frames are neighbours.
+    psf_kernel
+        Weights [y, x] of the PSF, centre at [n // 2, n // 2].
     """
     frame, start = frames[index], frames[index].place
     window = patch_window(frame.pixels.shape, start)

@@ -40,10 +40,15 @@ Places = NDArray[np.intp]
 
 @dataclass(eq=False)
 class Exposure:
-    """An image as it was read, with gaps: pixels [y, x] in DN/s.
+    """An image as it was read, with gaps: pixels [y, x] in DN/s. The pixels are changed in place when gaps are filled.
 
-    gaps: True for pixels that the mask marks (for example saturated pixels) or that are not finite; None if there are
-    none. saturated: the number of saturated pixels. The pixels are changed in place when gaps are filled.
+    Attributes
+    ----------
+    gaps
+        True for pixels that the mask marks (for example saturated pixels) or that are not finite; None if there are
+        none.
+    saturated
+        The number of saturated pixels.
     """
 
     file: str
@@ -61,8 +66,14 @@ class Exposure:
 class FrameCounts:
     """The numbers of saturated and of non-finite pixels of one frame, and the ways in which their values were replaced.
 
-    from_frames: pixels with a value from another frame. from_neighbours: pixels with the median of pixels near them.
-    unfilled: saturated pixels that no other frame of the pointing can fill; they keep their values.
+    Attributes
+    ----------
+    from_frames
+        Number of pixels with a value from another frame.
+    from_neighbours
+        Number of pixels with the median of pixels near them.
+    unfilled
+        Number of saturated pixels that no other frame of the pointing can fill; these pixels keep their values.
     """
 
     file: str

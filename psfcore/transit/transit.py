@@ -43,7 +43,10 @@ class Place:
 def check_reaches_in(place: Place, shape: tuple[int, ...], label: str) -> None:
     """Raise DataError "occulter-outside" if the square around a disc lies completely outside an image of (ny, nx) px.
 
-    label: the beginning of the message.
+    Parameters
+    ----------
+    label
+        The beginning of the message.
     """
     ny, nx = shape
     out_x = max(-0.5 - place.x_px, place.x_px - (nx - 0.5))
@@ -61,10 +64,15 @@ def check_reaches_in(place: Place, shape: tuple[int, ...], label: str) -> None:
 class Frame:
     """One image of a transit: pixels [y, x] in DN/s (float32, finite), and the occulter's position from the ephemeris.
 
-    time_s: seconds since the start of the first frame. filled: True for pixels [y, x] without a valid value of their
-    own. Their values come from another frame or from neighbouring pixels, or they are saturated. An analysis of the
-    occulter must not use these pixels. Raises DataError "frame-shape", "frame-nonfinite", "frame-exposure",
-    "occulter-outside".
+    Raises DataError "frame-shape", "frame-nonfinite", "frame-exposure", "occulter-outside".
+
+    Attributes
+    ----------
+    time_s
+        Seconds since the start of the first frame.
+    filled
+        True for pixels [y, x] without a valid value of their own. Their values come from another frame or from
+        neighbouring pixels, or they are saturated. An analysis of the occulter must not use these pixels.
     """
 
     file: str
@@ -104,9 +112,14 @@ class Frame:
 class Transit:
     """All frames of a transit, in time order and of equal shape, with the known part of the PSF and the noise.
 
-    diffraction: the known part of the PSF, weights [y, x], centre at [n // 2, n // 2], sum 1 on this array. sha256: the
-    SHA-256 of each input file, by name.
     Raises DataError "transit-shapes" if the shapes differ, "transit-empty" if there is no frame.
+
+    Attributes
+    ----------
+    diffraction
+        The known part of the PSF, weights [y, x], centre at [n // 2, n // 2], sum 1 on this array.
+    sha256
+        The SHA-256 of each input file, by name.
     """
 
     frames: tuple[Frame, ...]

@@ -89,7 +89,7 @@ def dust_shadow(effect: Effect, seen: Plane, moment: Moment) -> Plane:
     """Dust settled on the detector after the flat field was taken: specks with soft edges near positions of the
     occulter.
 
-    specks: x, y (fractions of the field), radius, px.
+    The parameter `specks` lists x, y (fractions of the field) and the radius (px) of each speck.
     """
     passed = np.ones_like(seen)
     for x, y, radius_px in effect["specks"]:
@@ -209,8 +209,8 @@ def column_smear(effect: Effect, dn: Plane, moment: Moment, earlier: list[Earlie
 
 @declare(KNOWN, "read_out", ("memory",), "share at time 0", 0.01, 0.3, decay=(0.5, 2.0))
 def persistence(effect: Effect, dn: Plane, moment: Moment, earlier: list[Earlier]) -> Plane:
-    """Traps release charge of the four preceding images, of any pointing. decay: the decay time, in mean times
-    between images.
+    """Traps release charge of the four preceding images, of any pointing. The parameter `decay` is the decay time, in
+    mean times between images.
     """
     shots = moment.plan.shots
     decay_s = effect["decay"] * (shots[-1].time_s - shots[0].time_s) / max(len(shots) - 1, 1)

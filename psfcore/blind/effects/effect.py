@@ -90,7 +90,7 @@ class EffectKind:
     Attributes
     ----------
     group
-        One of KNOWN, CALIBRATION, TEST.
+        The group: KNOWN, CALIBRATION or TEST.
     families
         The families of causes that are a right answer, the main one first.
     unit
@@ -104,15 +104,17 @@ class EffectKind:
     power
         The residual that the effect leaves is proportional to strength**power.
     varies
-        Whether its optics differ from image to image.
+        Whether the optics of the effect differ from image to image.
     noise_realisations
-        Number of noise realisations over which its change is averaged; 0 if the change does not depend on noise.
+        Number of noise realisations over which the change by the effect is averaged; 0 if the change does not depend on
+        noise.
     adds_light
-        Whether it adds light at places of the detector that stay the same; the truth then has a map of this light.
+        Whether the effect adds light at places of the detector that stay the same; the truth then has a map of this
+        light.
     form_of
         The effect of the gap library of which this withheld effect is another form.
     also
-        Effects of the library that it brings along, so that it is not wrong to name them.
+        Effects of the library that the effect brings along, so that it is not wrong to name them.
     saturation_dn
         The level in DN at which high-only images clip, from the effect, all exposures and the plan.
     """
@@ -156,8 +158,14 @@ def declare(
     options: Mapping[str, Any] | None = None,
     **draw: Draw,
 ) -> Callable[[Function], Function]:
-    """Add the decorated function to EFFECTS, under its own name. options: further fields of `EffectKind`. draw: its
-    parameters.
+    """Add the decorated function to EFFECTS, under its own name.
+
+    Parameters
+    ----------
+    options
+        Further fields of `EffectKind`.
+    **draw
+        The parameters of the effect, and how each is drawn.
     """
 
     def add(change: Function) -> Function:
@@ -187,8 +195,8 @@ class Effect:
         return replace(self, strength=strength)
 
     def as_json(self) -> dict[str, object]:
-        """The effect for the truth of a case. cause: its name in the gap library; None if the library does not
-        contain it.
+        """The effect for the truth of a case. The entry `cause` is the name of the effect in the gap library; None if
+        the library does not contain the effect.
         """
         kind = self.kind
         return {
@@ -216,7 +224,12 @@ def unit_coordinates(
 ) -> tuple[Plane, Plane]:
     """Coordinates of the pixels [y, x] along and across a direction, in widths of the field, from a point.
 
-    angle_deg: the direction, from +x towards +y. at: the point (x, y), fractions of the field.
+    Parameters
+    ----------
+    angle_deg
+        The direction, from +x towards +y.
+    at
+        The point (x, y), fractions of the field.
     """
     ny, nx = shape
     u, v = (np.arange(nx)[None, :] + 0.5) / nx - at[0], (np.arange(ny)[:, None] + 0.5) / ny - at[1]
@@ -245,8 +258,12 @@ def seed(plan: Plan, rng: np.random.Generator) -> int:
 
 
 def near_a_disc(spread: float) -> Callable[[Plan, np.random.Generator], tuple[float, float]]:
-    """Draws a point (x, y), fractions of the field, near a random position of the occulter. spread: rms distance per
-    axis.
+    """A function that draws a point (x, y), fractions of the field, near a random position of the occulter.
+
+    Parameters
+    ----------
+    spread
+        Rms distance of the points from this position per axis.
     """
 
     def draw(plan: Plan, rng: np.random.Generator) -> tuple[float, float]:

@@ -147,10 +147,13 @@ def _pupil(name: str, size: int) -> Kernel:
 
 @dataclass(frozen=True, eq=False)
 class FineOptics:
-    """A telescope: its scatter kernel and its diffraction PSF on fine pixels [y, x], each with the centre at [n // 2,
-    n // 2].
+    """A telescope: its scatter kernel and its diffraction PSF on fine pixels [y, x], each with the centre at [n // 2, n
+    // 2].
 
-    law, glass: the parameters of the two kernels; effects use them to compute changed kernels.
+    Attributes
+    ----------
+    law, glass
+        The parameters of the scatter kernel and of the diffraction PSF; effects use them to compute changed kernels.
     """
 
     law: ScatterTruth
@@ -228,7 +231,13 @@ def binned_glass(glass: Glass) -> Kernel:
 
 
 def turned_offsets(optics: FineOptics, angle_deg: float) -> tuple[Kernel, Kernel]:
-    """The offsets of the fine pixels along and across a direction, in detector px. angle_deg: from +x towards +y."""
+    """The offsets of the fine pixels along and across a direction, in detector px.
+
+    Parameters
+    ----------
+    angle_deg
+        The direction, from +x towards +y.
+    """
     x, y = optics.offsets_px
     cos, sin = np.cos(np.deg2rad(angle_deg)), np.sin(np.deg2rad(angle_deg))
     return x * cos + y * sin, y * cos - x * sin

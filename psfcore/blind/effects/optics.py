@@ -55,8 +55,12 @@ def one_sided_scatter(effect: Effect, optics: FineOptics, moment: Moment) -> Fin
 
 
 def rescaled(optics: FineOptics, falloff: Plane, before: Plane) -> FineOptics:
-    """The telescope with another falloff of the scatter; the total of the scatter stays the same. before: the old
-    falloff.
+    """The telescope with another falloff of the scatter; the total of the scatter stays the same.
+
+    Parameters
+    ----------
+    before
+        The old falloff, which `falloff` replaces.
     """
     amplitude = optics.law.a / FINE**2 * float(before.sum() / falloff.sum())
     return dataclasses.replace(optics, scatter=scaled_scatter(falloff, optics.law, amplitude))
@@ -66,7 +70,7 @@ def rescaled(optics: FineOptics, falloff: Plane, before: Plane) -> FineOptics:
 def wide_halo(effect: Effect, optics: FineOptics, moment: Moment) -> FineOptics:
     """Particles or a second surface scatter a fraction of the light into an exponential or Moffat halo.
 
-    scale: the scale of the halo, in widths of the field.
+    The parameter `scale` is the scale of the halo, in widths of the field.
     """
     x, y = optics.offsets_px
     r, scale_px = np.hypot(x, y), effect["scale"] * moment.plan.size_px
@@ -102,7 +106,13 @@ def _blurred(optics: FineOptics, blur: Plane) -> FineOptics:
 
 
 def _sampled(reach_px: float, profile: Callable[[Plane, Plane], Plane]) -> Plane:
-    """A kernel [y, x] on fine pixels with the sum 1. profile: its value at x and y, detector px, up to reach_px."""
+    """A kernel [y, x] on fine pixels with the sum 1.
+
+    Parameters
+    ----------
+    profile
+        Function of x and y, detector px, that gives the value of the kernel, up to reach_px.
+    """
     half = int(np.ceil(reach_px * FINE)) + 1
     n = 2 * half + 1
     at = ((np.arange(n * _FINER) + 0.5) / _FINER - half - 0.5) / FINE
@@ -181,8 +191,8 @@ def field_dependent_scatter(
 def ghost(effect: Effect, seen: Plane, moment: Moment) -> Plane:
     """Light is reflected between the filter and the detector.
 
-    It is a faint copy of the image that is displaced, out of focus, slightly rotated and slightly magnified. shift: the
-    distance of the copy, in widths of the field.
+    The ghost is a faint copy of the image that is displaced, out of focus, slightly rotated and slightly magnified. The
+    parameter `shift` is the distance of the copy, in widths of the field.
     """
     n, magnification = seen.shape[0], effect["magnification"]
     cos, sin = direction(effect["turn_deg"])

@@ -70,8 +70,9 @@ def out_of_field_light(effect: Effect, seen: Plane, moment: Moment) -> Plane:
     """In each pointing, a bright band beyond one edge of the field scatters light into the field.
 
     The brightness of the band in a pointing is the strength times the entry of `levels`. The band is half as wide as
-    the field, and begins a twelfth of the field beyond the edge. edges: the edge of each pointing; 0 left, 1 right, 2
-    below, 3 above. b_px, c, a: parameters of the power law that scatters the light of the band.
+    the field, and begins a twelfth of the field beyond the edge. `edges` holds the edge of each pointing: 0 left, 1
+    right, 2 below, 3 above. `b_px`, `c` and `a` are the parameters of the power law that scatters the light of the
+    band.
     """
     pointing = moment.shot.pointing - 1
     band = _band(seen.shape[0], effect["edges"][pointing], effect["b_px"], effect["c"], effect["a"])
@@ -159,8 +160,12 @@ def saturation_fill(effect: Effect, scene: Plane, moment: Moment) -> Plane:
 
 @cache
 def patches(size: int, seed: int, patch: float) -> Plane:
-    """A smooth random plane [y, x] with mean 0 and rms 1. patch: the size of its patches, as a fraction of the
-    field.
+    """A smooth random plane [y, x] with mean 0 and rms 1.
+
+    Parameters
+    ----------
+    patch
+        The size of the patches, as a fraction of the field.
     """
     rng = np.random.default_rng(seed)
     coarse = max(8, int(np.ceil(4 / patch)))

@@ -43,8 +43,8 @@ def occulter_tail(effect: Effect, lit: Plane, moment: Moment) -> Plane:
     """Gas of the occulter emits light in front of it and in a tail, which moves with the disc. The light fades during
     the transit.
 
-    length: the length of the tail, in radii of the disc. fading: the brightness at time t of 0 to 1 is 1 / (1 +
-    fading t).
+    The parameter `length` is the length of the tail, in radii of the disc. The brightness at time t of 0 to 1 is 1 / (1
+    + `fading` t).
     """
     place, n = moment.plan.place(moment.index), lit.shape[0]
     x, y = ((np.arange(n) + 0.5) / FINE - 0.5 - at for at in (place.x_px, place.y_px))
@@ -77,7 +77,7 @@ def transparent_limb(effect: Effect, share: Plane, around: Behind, moment: Momen
 def dust_release(effect: Effect, seen: Plane, lit: Plane, optics: FineOptics, moment: Moment) -> Plane:
     """A jolt of the filter wheel shakes dust onto a mirror: from one image to the next the total of the scatter jumps.
 
-    instant: the elapsed fraction of the transit at the jolt.
+    The parameter `instant` is the elapsed fraction of the transit at the jolt.
     """
     if moment.elapsed < effect["instant"]:
         return seen
@@ -112,11 +112,11 @@ def _drops(plan: Plan, rng: np.random.Generator) -> tuple[tuple[float, ...], ...
 
 @declare(TEST, "spread", ("psf_place_time", "psf_place"), "share of the scatter", 0.2, 1.0, drops=_drops)
 def condensation(effect: Effect, seen: Plane, lit: Plane, optics: FineOptics, moment: Moment) -> Plane:
-    """Vapour condenses on a cold filter near the focus: drops with an edge appear one after another. The scatter
-    there is stronger.
+    """Vapour condenses on a cold filter near the focus: drops with an edge appear one after another. The scatter there
+    is stronger.
 
-    drops: x, y and radius (fractions of the field) of each drop, and the elapsed fraction of the transit at which it
-    appears.
+    The parameter `drops` lists x, y and radius (fractions of the field) of each drop, and the elapsed fraction of the
+    transit at which the drop appears.
     """
     wet = [
         np.hypot(*unit_coordinates(lit.shape, at=(x, y))) < radius
@@ -144,7 +144,7 @@ def rough_rim(effect: Effect, seen: Plane, lit: Plane, optics: FineOptics, momen
     """The rim of a mirror is polished badly, and light from far off the axis meets it: the scatter rises as a steep
     power.
 
-    axis: x, y, fractions of the field. The scatter at most doubles.
+    The parameter `axis` is the point x, y of the axis, fractions of the field. The scatter at most doubles.
     """
     away = 2 * np.hypot(*unit_coordinates(lit.shape, at=effect["axis"]))
     more = np.minimum(effect.strength * away ** effect["exponent"], 1.0)
@@ -203,8 +203,8 @@ def foil_creases(effect: Effect, seen: Plane, moment: Moment) -> Plane:
     """The foil of a filter before the detector has creases, through which visible sunlight passes: narrow straight
     lines.
 
-    creases: x and y of a point (fractions of the field), direction (degrees) and half width (fraction of the field)
-    of each.
+    The parameter `creases` lists x and y of a point (fractions of the field), direction (degrees) and half width
+    (fraction of the field) of each crease.
     """
     light = np.zeros_like(seen)
     for x, y, angle_deg, half_width in effect["creases"]:

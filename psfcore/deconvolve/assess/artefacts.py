@@ -65,9 +65,17 @@ Pixels = TypeVar("Pixels", NDArray[np.floating], NDArray[np.bool_])
 class Artefacts:
     """Signs of artefacts in one image.
 
-    suspected: pixels [y, x] that show a sign of Eq. (1) to (3). signs: the measured value of each sign, with the names
-    of ALARMS; ringing_pct is None if there are fewer than three bright sources. sources: number of bright sources.
-    score: artefact score; 0 means no signs, and an image with a score of 1 or more should be inspected.
+    Attributes
+    ----------
+    suspected
+        Pixels [y, x] that show a sign of Eq. (1) to (3).
+    signs
+        The measured value of each sign, with the names of ALARMS; ringing_pct is None if there are fewer than three
+        bright sources.
+    sources
+        Number of bright sources.
+    score
+        Artefact score; 0 means no signs, and an image with a score of 1 or more should be inspected.
     """
 
     suspected: Flags
@@ -85,9 +93,13 @@ def find_artefacts(
 ) -> Artefacts:
     """Find signs of artefacts in the counted pixels of `after` [y, x].
 
-    before, after: finite (`filled`), in single precision, which is accurate enough and twice as fast. sigma: function
-    that returns the noise of `before` at positions [y, x], in the unit of `before`; None: the noise is estimated from
-    the pixels.
+    Parameters
+    ----------
+    before, after
+        The images [y, x], finite (`filled`), in single precision, which is accurate enough and twice as fast.
+    sigma
+        Function that returns the noise of `before` at positions [y, x], in the unit of `before`; None: the noise is
+        estimated from the pixels.
     """
     classes = classes_of(before[counted])
     noise_after = noise_levels(after, counted, classes)
@@ -113,7 +125,12 @@ def find_artefacts(
 class BrightnessClasses:
     """Classes of pixels by brightness. All classes have the same number of pixels.
 
-    numbers: the class of each pixel (n,). centres: median brightness of each class; empty: there are no classes.
+    Attributes
+    ----------
+    numbers
+        The class of each pixel (n,).
+    centres
+        Median brightness of each class; empty: there are no classes.
     """
 
     numbers: ranks.Groups
@@ -133,8 +150,12 @@ def classes_of(brightness: Plane) -> BrightnessClasses:
 class NoiseLevels:
     """The noise of pixels as a function of their brightness.
 
-    centres, levels: brightness and noise of the classes; empty: no classes. smallest: the noise is not below this
-    value.
+    Attributes
+    ----------
+    centres, levels
+        Brightness and noise of the classes; empty: no classes.
+    smallest
+        The lower limit of the noise.
     """
 
     centres: Plane
@@ -196,7 +217,13 @@ def row_blocks(count: int) -> Iterator[slice]:
 def _blocks_with_rim(
     plane: Pixels, rim_px: int, rim: Literal["edge", "symmetric"]
 ) -> Iterator[tuple[slice, Pixels]]:
-    """The blocks of `row_blocks`, and their pixels with a rim on all sides. rim: as the mode of `numpy.pad`."""
+    """The blocks of `row_blocks`, and their pixels with a rim on all sides.
+
+    Parameters
+    ----------
+    rim
+        How the rim is filled, as a mode of `numpy.pad`.
+    """
     for rows in row_blocks(len(plane)):
         first, last = max(rows.start - rim_px, 0), min(rows.stop + rim_px, len(plane))
         missing = (rim_px - (rows.start - first), rim_px - (last - rows.stop))
@@ -267,7 +294,12 @@ def _peaks(block: Plane, before: Plane, noise_after: NoiseLevels, sign: int) -> 
     """The pixels of a block that may fulfil Eq. (3): for the sign 1 those that are the largest of 3 x 3 px, for -1 the
     smallest ones.
 
-    block: rows of the image after, with a rim of 2 px. before: the same rows of the image before.
+    Parameters
+    ----------
+    block
+        Rows of the image after deconvolution, with a rim of 2 px.
+    before
+        The same rows of the image before deconvolution.
     """
     nearest, farthest = (np.maximum, np.minimum) if sign > 0 else (np.minimum, np.maximum)
     pixels, inner = block[2:-2, 2:-2], block[1:-1, 1:-1]
@@ -290,7 +322,10 @@ def _portions(*arrays: NDArray[Any]) -> Iterator[tuple[NDArray[Any], ...]]:
 def _differences(block: Plane, places: Places) -> Plane:
     """The pixels at these positions minus each pixel of the 5 x 5 px around them, (n, 25).
 
-    block: some rows with a rim of 2 px, which the positions do not count.
+    Parameters
+    ----------
+    block
+        Some rows with a rim of 2 px; the positions do not count the rim.
     """
     side = 2 * _MEDIAN_RADIUS_PX + 1
     around = np.lib.stride_tricks.sliding_window_view(block, (side, side))[places].reshape(-1, side**2)

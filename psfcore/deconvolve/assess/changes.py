@@ -58,11 +58,11 @@ class Structure:
     Attributes
     ----------
     kind
-        Bright or dark.
+        The kind of the blocks: bright or dark.
     sum_pct
-        Change of the summed light of these blocks.
+        Change of the summed light of these blocks, percent.
     median_pct
-        Median of their changes.
+        Median of the changes of these blocks, percent.
     up_to_pct
         Percentile 99 of the changes of bright blocks, or percentile 1 of the changes of dark blocks.
     before
@@ -146,9 +146,18 @@ def measure_changes(
 ) -> Changes:
     """Compare an image with its deconvolution, `result` [y, x], in the trusted pixels.
 
-    psf: the PSF with which the image was deconvolved. edge_px: width of the band at the edges that is left out. noise:
-    noise of the camera; if it is None, the artefact check estimates the noise from the pixels. threads: with 2 or more,
-    a second thread runs the artefact check. Raises DataError "field-shape", "no-signal", "no-exposure".
+    Raises DataError "field-shape", "no-signal", "no-exposure".
+
+    Parameters
+    ----------
+    psf
+        The PSF with which the image was deconvolved.
+    edge_px
+        Width of the band at the edges that is left out.
+    noise
+        Noise of the camera; if it is None, the artefact check estimates the noise from the pixels.
+    threads
+        Number of threads; with 2 or more, a second thread runs the artefact check.
     """
     if result.shape != image.pixels.shape:
         raise DataError("field-shape", f"expected a result of {image.pixels.shape}; got {result.shape}")
@@ -288,7 +297,10 @@ def _structures(blocks: _Blocks) -> list[Structure]:
 def _structure(blocks: _Blocks, old: Means, new: Means, kind: str, tail: float) -> Structure | None:
     """One row of the table; None if no block of the tail was above zero before deconvolution.
 
-    old, new: means of the brightest and darkest blocks, before and after deconvolution.
+    Parameters
+    ----------
+    old, new
+        Means of the brightest and darkest blocks, before and after deconvolution.
     """
     bright = kind == "bright"
     level = blocks.old_levels[tail][bright]
@@ -360,7 +372,7 @@ def _percentiles(
 
 
 def _change_pct(before: Plane | Means, after: Plane, *, out: Plane | None = None) -> Plane:
-    """Eq. (1). out: the array that takes the result, for example `after`."""
+    """The change in percent, Eq. (1); `out` is the array that takes the result, for example `after`."""
     change = np.divide(after, before, out=out)
     change -= 1
     change *= 100
@@ -406,8 +418,14 @@ def quality_plane(
 ) -> NDArray[np.uint8]:
     """Make the quality plane, bits of QualityBit [y, x], for `result`, the deconvolution of `image`.
 
-    edge_px: width of the band at the edges (`Deconvolved.edge_band_px`). suspected: pixels with a sign of an
-    artefact. error: noise plane; None: no noise plane was computed, and no pixel has NO_ERROR.
+    Parameters
+    ----------
+    edge_px
+        Width of the band at the edges (`Deconvolved.edge_band_px`).
+    suspected
+        Pixels with a sign of an artefact.
+    error
+        Noise plane; None: no noise plane was computed, and no pixel has NO_ERROR.
     """
     plane = np.zeros(result.shape, dtype=np.uint8)
     for mask_bit, bit in (

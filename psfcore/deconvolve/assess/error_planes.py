@@ -66,10 +66,17 @@ Plane = NDArray[np.float64]
 class ErrorPlanes:
     """1-sigma planes [y, x] of a deconvolved image, in the unit of the image; NaN where a pixel is not trusted.
 
-    error: standard deviation from photon and read noise. psf_error: standard deviation from the uncertainty of the PSF;
-    None if this uncertainty is not known. amplification: median of error divided by the noise of the observation; None
-    if the edge bands cover all pixels. degrees_of_freedom: degrees of freedom of the variance of a pixel; the relative
-    error of the variance is sqrt(2 / degrees_of_freedom).
+    Attributes
+    ----------
+    error
+        Standard deviation from photon and read noise.
+    psf_error
+        Standard deviation from the uncertainty of the PSF; None if this uncertainty is not known.
+    amplification
+        Median of error divided by the noise of the observation; None if the edge bands cover all pixels.
+    degrees_of_freedom
+        Degrees of freedom of the variance of a pixel; the relative error of the variance is sqrt(2 /
+        degrees_of_freedom).
     """
 
     error: Plane
@@ -91,10 +98,19 @@ def error_planes(
 ) -> ErrorPlanes:
     """Compute the error plane of `run(image)`. `run` deconvolves an image of this shape and mask with any method.
 
-    conditions: with the noise of the camera, and the threads; progress(done, of) is called after each run, and its
-    exceptions are not caught. estimate: run(image). draws: number of noise realisations, 2 or more. edge_px: width of
-    the band at the edges that is left out of the amplification. The same seed gives the same planes. Raises DataError
-    "bad-draws", "no-exposure".
+    The same seed gives the same planes. Raises DataError "bad-draws", "no-exposure".
+
+    Parameters
+    ----------
+    conditions
+        The noise of the camera, the threads, and progress(done, of), which is called after each run; exceptions of
+        `progress` are not caught.
+    estimate
+        The deconvolved image, run(image).
+    draws
+        Number of noise realisations, 2 or more.
+    edge_px
+        Width of the band at the edges that is left out of the amplification.
     """
     if draws < SMALLEST_DRAWS:
         raise DataError("bad-draws", f"expected at least {SMALLEST_DRAWS} noise realisations; got {draws}")
@@ -161,9 +177,14 @@ def spread_of_results(
 def sigma_points(mean: NDArray[np.float64], covariance: NDArray[np.float64]) -> NDArray[np.float64]:
     """The parameter vectors whose mean and covariance are exactly the given ones: two for each parameter, (2 p, p).
 
-    mean: (p,). covariance: (p, p).
-
     Raises DataError "bad-covariance" if the covariance is not symmetric or has a negative eigenvalue.
+
+    Parameters
+    ----------
+    mean
+        The mean of the parameters (p,).
+    covariance
+        The covariance of the parameters (p, p).
     """
     covariance = np.asarray(covariance, dtype=np.float64)
     count = len(mean)

@@ -64,7 +64,12 @@ def changes_png(
 ) -> None:
     """Draw before, after, change in percent, difference, ratio and histogram into a PNG file.
 
-    before, after: pixels [y, x] in `unit`; row 0 is drawn at the bottom. changes: the numbers below the panels.
+    Parameters
+    ----------
+    before, after
+        Pixels [y, x] in `unit`; row 0 is drawn at the bottom.
+    changes
+        The numbers below the panels.
     """
     panels = compared_panels(before, after, unit)
     old, new = panels[0].pixels, panels[1].pixels
@@ -152,8 +157,16 @@ def _largest(plane: Plane) -> float:
 class Treated:
     """One deconvolved image.
 
-    taken: date of the observation. changes: the measured changes, as `Changes.as_json` gives them. before, after:
-    thumbnails [y, x]. suspected: positions [y, x] of the thumbnail pixels with suspected artefacts, shape (n, 2).
+    Attributes
+    ----------
+    taken
+        Date of the observation.
+    changes
+        The measured changes, as `Changes.as_json` gives them.
+    before, after
+        Thumbnails [y, x] of the image before and after deconvolution.
+    suspected
+        Positions [y, x] of the thumbnail pixels with suspected artefacts, shape (n, 2).
     """
 
     name: str
@@ -208,10 +221,16 @@ class Failure:
 def changes_in_product(
     name: str, before: str | Path, product: str | Path, details: Mapping[str, Any], limits: FitsLimits
 ) -> Treated:
-    """Make the row of one image. ``before``, ``product``: the FITS files of the image and of its product.
+    """Make the row of one image.
 
-    details: the product's details, with "changes", "steps_done" and "stopped_because". Raises the errors of
-    ``read_observation``.
+    Raises the errors of ``read_observation``.
+
+    Parameters
+    ----------
+    before, product
+        The FITS files of the image and of its product.
+    details
+        The details of the product, with "changes", "steps_done" and "stopped_because".
     """
     image, after = read_observation(before, limits), read_observation(product, limits)
     suspected = (read_planes(product)["QUALITY"] & QualityBit.ARTEFACT) > 0

@@ -37,8 +37,12 @@ def percentiles(values: NDArray[np.generic], levels: Sequence[float]) -> NDArray
 
 
 def medians(values: Values, groups: Groups, count: int) -> NDArray[np.float64]:
-    """The median of the values (n,) of each of `count` groups. groups: the number of the group of each value; none is
-    empty.
+    """The median of the values (n,) of each of `count` groups.
+
+    Parameters
+    ----------
+    groups
+        The number of the group of each value; no group is empty.
     """
     if count == 0:
         return np.empty(0)
@@ -111,7 +115,13 @@ def _count(values: Values, groups: Groups, counts: NDArray[np.int64]) -> None:
 def _collect(
     values: Values, groups: Groups, wanted: NDArray[np.bool_], starts: NDArray[np.intp], chosen: Values
 ) -> None:
-    """Copy the values in the wanted bins [group, bin]. starts: the place of the first one of each group."""
+    """Copy the values in the wanted bins [group, bin].
+
+    Parameters
+    ----------
+    starts
+        The place of the first value of each group in `chosen`.
+    """
     bits = values.view(np.int32)
     place = starts.copy()
     for n in range(bits.size):
@@ -122,8 +132,12 @@ def _collect(
 
 @compiled()
 def _cut(values: Values, borders: Values, lower: NDArray[np.int64], parts: Groups) -> None:
-    """Write the part of each value: the number of borders below it. lower: how many values that equal a border are
-    below it.
+    """Write the part of each value: the number of borders below it.
+
+    Parameters
+    ----------
+    lower
+        For each border, how many of the values that equal the border count as below it.
     """
     bits, equal = values.view(np.int32), np.zeros(borders.size, np.int64)
     first = np.zeros(_BINS, np.uint8)  # the number of borders in lower bins

@@ -96,8 +96,11 @@ class LinearIteration(Iteration):
 class Additive(LinearIteration):
     """The iteration of Eq. (1).
 
-    step_filter: G, divided by `engine.transfer_scale`, in the layout of `engine.transfer`. A constant G is
-    `np.full_like(engine.transfer[:, :, :1], G / engine.transfer_scale)`.
+    Parameters
+    ----------
+    step_filter
+        The filter G, divided by `engine.transfer_scale`, in the layout of `engine.transfer`. A constant G is
+        `np.full_like(engine.transfer[:, :, :1], G / engine.transfer_scale)`.
     """
 
     def __init__(self, problem: Problem, step_filter: NDArray[np.float32]) -> None:
@@ -122,9 +125,17 @@ def _all_rows(engine: Engine) -> int:
 def solve_linear(
     engine: Engine, step_filter: NDArray[np.float32], observed: Single, start: Single, steps: int
 ) -> Single:
-    """X after some steps of Eq. (1), for an observation whose pixels are all trusted; in the engine's layout.
+    """The estimate x after some steps of Eq. (1), for an observation whose pixels are all trusted; in the engine's
+    layout.
 
-    start: the first estimate. The scene is dark beyond the edges of the field. step_filter: as for `Additive`.
+    The scene is dark beyond the edges of the field.
+
+    Parameters
+    ----------
+    start
+        The first estimate.
+    step_filter
+        The filter of a step, as for `Additive`.
     """
     x, rows = start.copy(), engine.field_shape[0]
     changes, sums = np.zeros((2, engine.row_blocks)), np.zeros(engine.row_blocks)
@@ -163,7 +174,13 @@ def transfer_sample(engine: Engine) -> TransferSample:
 def noise_amplification(
     sample: TransferSample, step: NDArray[np.floating] | NDArray[np.complexfloating], steps: int
 ) -> float:
-    """Rms noise of the estimate after `steps` steps, divided by the rms noise of the image. step: G of Eq. (2)."""
+    """Rms noise of the estimate after `steps` steps, divided by the rms noise of the image.
+
+    Parameters
+    ----------
+    step
+        The filter G of Eq. (2).
+    """
     # The closed form A_n = (1 - (1 - G T)^n (1 - T)) / T fails for T near 0.
     gain = np.ones_like(sample.values)
     for _ in range(steps):

@@ -62,8 +62,14 @@ _SUMMED = 16 * LANES
 class LucyIteration(Iteration):
     """The first half of a step of every Richardson-Lucy method: `measure` replaces H x by the ratio of Eq. (2).
 
-    agreed [y, x]: a of Eq. (2), above 0. brightest: largest value of the first estimate; the floor is a fraction of it.
-    dark: estimates below this value are set to 0.
+    Estimates below the attribute `dark` are set to 0.
+
+    Parameters
+    ----------
+    agreed
+        The array a [y, x] of Eq. (2), above 0.
+    brightest
+        Largest value of the first estimate; the floor is a fraction of this value.
     """
 
     def __init__(self, problem: Problem, agreed: Single | float, brightest: float) -> None:

@@ -86,7 +86,10 @@ def _correct(
 ) -> None:
     """Compute new <- prediction * correction and gradient <- new - prediction, and the sums for Eq. (3) and the change.
 
-    planes: new, prediction, correction, x, gradient.
+    Parameters
+    ----------
+    planes
+        The planes new, prediction, correction, x and gradient.
     """
     new, prediction, correction, x, gradient = planes
     zero = np.float32(0.0)
@@ -117,7 +120,10 @@ def _predict(
 ) -> None:
     """Compute the prediction of Eq. (1). Where x is above 0, the prediction is kept above 0.
 
-    planes: prediction, x, and x one and two steps before.
+    Parameters
+    ----------
+    planes
+        The planes of the prediction, of x, and of x one and two steps before.
     """
     prediction, x, before, earlier = planes
     two = np.float32(2.0)

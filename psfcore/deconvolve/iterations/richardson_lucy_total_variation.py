@@ -94,7 +94,10 @@ def _smooth_rows(
 ) -> None:
     """Compute `new` by Eq. (1) on rows [start, stop). Set values below `dark` to 0. Sum (change)^2 and x^2 by row.
 
-    planes: x, correction, new.
+    Parameters
+    ----------
+    planes
+        The planes x, correction and new.
     """
     x, correction, new = planes
     zero, one = np.float32(0.0), np.float32(1.0)

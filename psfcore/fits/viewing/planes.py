@@ -48,7 +48,7 @@ class Plane:
     """A decoded plane: little-endian float32, row 0 first. Any number of threads may read it."""
 
     def __init__(self, path: Path, decoded: Decoded) -> None:
-        """path: the file of the pixels. It may be removed afterwards. Raises OSError."""
+        """Open the file of the pixels, which may be removed afterwards. Raises OSError."""
         self.shape, self.unit = decoded.shape, decoded.unit
         self._handle = os.open(path, os.O_RDONLY)
         weakref.finalize(self, os.close, self._handle)
@@ -71,7 +71,9 @@ class Planes:
     """Keeps the planes that were used last: at most MOST_PLANES planes, with at most MOST_BYTES together."""
 
     def __init__(self, temporary: Callable[[], AbstractContextManager[Path]]) -> None:
-        """temporary: a context manager that gives a path for a temporary file and removes the file at the end."""
+        """Keep no plane yet; `temporary` gives a path for a temporary file as a context manager, which removes the file
+        at the end.
+        """
         self._temporary = temporary
         self._kept: OrderedDict[Key, Plane] = OrderedDict()
         self._lock = threading.Lock()
@@ -111,9 +113,14 @@ class Planes:
 def decode_plane(path: str | Path, name: str, limits: FitsLimits, target: BinaryIO) -> Decoded:
     """Write the pixels of a plane to ``target`` as little-endian float32, in the order of the FITS file (row 0 first).
 
-    NaN stays NaN. name: IMAGE for the first 2-D image of the file, or the name of a plane of a product, for example
-    "quality". Returns the shape and the unit of the plane. Raises HeaderError for an unusable header; DataError
+    NaN stays NaN. Returns the shape and the unit of the plane. Raises HeaderError for an unusable header; DataError
     "unreadable-pixels" or "no-such-plane".
+
+    Parameters
+    ----------
+    name
+        Name of the plane: IMAGE for the first 2-D image of the file, or the name of a plane of a product, for example
+        "quality".
     """
     hdu = None if name == IMAGE else _number_of_plane(path, name.upper(), limits)
     shape = read_summary(path, limits, hdu=hdu).shape

@@ -70,7 +70,12 @@ def window_of(
 def pixels(plane: Plane, window: Window, *, bits: bool) -> Iterator[bytes]:
     """The pixels of a window as little-endian float32, row 0 first, some rows at a time.
 
-    bits: whether the plane holds bits, see above. Raises EOFError if the plane cannot be read.
+    Raises EOFError if the plane cannot be read.
+
+    Parameters
+    ----------
+    bits
+        Whether the plane holds bits, see above.
     """
     at_once = max(1, _BLOCK_BYTES // (plane.shape[1] * PIXEL_BYTES))
     step, end = window.step, window.y + window.height
@@ -95,7 +100,10 @@ def _read(plane: Plane, window: Window, first: int, end: int, at_once: int) -> I
 def _mean(pieces: Iterator[NDArray[np.float32]], step: int) -> NDArray[np.float64]:
     """Means of blocks.
 
-    ``pieces``: one piece with several rows of blocks, or several pieces that together form one row.
+    Parameters
+    ----------
+    pieces
+        One piece with several rows of blocks, or several pieces that together form one row.
     """
     total = count = np.zeros(())
     for piece in pieces:

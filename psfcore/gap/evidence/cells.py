@@ -44,8 +44,16 @@ LEAST_VARIANCE = 1e-12
 class Cells:
     """The cells of one disc.
 
-    weights: (cells, dark pixels). pixels: number of pixels of each cell. radius: mean radius of each cell, divided by
-    the radius of the outermost dark pixel. azimuth: mean azimuth of each cell, rad.
+    Attributes
+    ----------
+    weights
+        The weight of each dark pixel in each cell (cells, dark pixels).
+    pixels
+        Number of pixels of each cell.
+    radius
+        Mean radius of each cell, divided by the radius of the outermost dark pixel.
+    azimuth
+        Mean azimuth of each cell, rad.
     """
 
     weights: Matrix
@@ -57,7 +65,10 @@ class Cells:
 def cells_of(dark: Pixels, x_px: float, y_px: float) -> Cells:
     """Divide the dark pixels of a disc into cells. Cells with fewer than LEAST_PIXELS pixels are left out.
 
-    x_px, y_px: the centre of the disc.
+    Parameters
+    ----------
+    x_px, y_px
+        The centre of the disc.
     """
     dx, dy = dark[1] - x_px, dark[0] - y_px
     r = np.hypot(dx, dy)
@@ -121,7 +132,7 @@ class DiscCells:
     jacobian
         The derivatives (columns, cells), DN/s for one unit of a parameter.
     pixels, radius, azimuth
-        As in `Cells`.
+        Size and place of each cell, as in `Cells`.
     boxes
         The sensitivities of the cells, and these times the expected image, each summed over boxes of the detector (2,
         cells, rows, columns).

@@ -72,7 +72,7 @@ class Form:
     family
         The name of the family in `tree.FAMILIES`, or the family of an added effect.
     effect
-        The name of the library for this form; None if it has none.
+        The name of the library for this form; None: the library has no name for it.
     columns
         The numbers of the columns of this form.
     likely
@@ -117,8 +117,16 @@ class Form:
 
 @dataclass(frozen=True, eq=False)
 class Variant:
-    """One prior of a form. part: the coefficients that may differ from 0. scale: their size, in units of the likely
-    size. cost: -ln of the prior probability of the variant.
+    """One prior of a form.
+
+    Attributes
+    ----------
+    part
+        The coefficients that may differ from 0.
+    scale
+        The size of these coefficients, in units of the likely size.
+    cost
+        -ln of the prior probability of the variant.
     """
 
     form: Form
@@ -145,7 +153,15 @@ class Inexact:
     values: Vector
 
     def change(self, design: Matrix, numbers: Columns) -> Matrix:
-        """The change by these causes. design: (..., columns). numbers: of its columns; other columns are 0 there."""
+        """The change by these causes.
+
+        Parameters
+        ----------
+        design
+            The columns of the linear model (..., columns).
+        numbers
+            The numbers of the columns of `design`; other columns are 0 there.
+        """
         place = {number: k for k, number in enumerate(numbers.tolist())}
         columns = np.concatenate([one.columns for one in self.variants]).tolist()
         shown = [k for k, column in enumerate(columns) if column in place]
@@ -154,8 +170,18 @@ class Inexact:
 
 @dataclass(frozen=True, eq=False)
 class _Sums:
-    """Sums over the blocks. normal: (shown, shown). score: (shown, data). chi2: (data,). log_det: ln det of the
-    covariance that the Sun adds.
+    """Sums over the blocks.
+
+    Attributes
+    ----------
+    normal
+        The normal matrix (shown, shown).
+    score
+        The right-hand sides (shown, data).
+    chi2
+        The chi2 of each set of data (data,).
+    log_det
+        The ln det of the covariance that the Sun adds.
     """
 
     normal: Matrix
@@ -167,9 +193,15 @@ class _Sums:
 class ClosedForm:
     """The evidence of causes for the data of a linear model.
 
-    columns: the columns of its fields. inexact: the causes whose errors of form join the noise. draws: further data
-    (discs: (cells, draws), blocks: (images, blocks, draws), DN/s in blocks and units of the noise in cells) that take
-    the place of the data of the model; every ln E is then an array (draws,).
+    Parameters
+    ----------
+    columns
+        The columns of the fields of the model.
+    inexact
+        The causes whose errors of form join the noise.
+    draws
+        Further data (discs: (cells, draws), blocks: (images, blocks, draws), DN/s in blocks and units of the noise in
+        cells) that take the place of the data of the model; every ln E is then an array (draws,).
     """
 
     def __init__(
@@ -486,7 +518,10 @@ def _joined(variants: Sequence[Variant]) -> tuple[Columns, Vector, Flags, Column
 def _centred(design: Matrix, weight: Matrix) -> Matrix:
     """The design (images, blocks, columns), changed to units of the noise with the mean scene of each block eliminated.
 
-    weight: (images, blocks).
+    Parameters
+    ----------
+    weight
+        The weight of each block (images, blocks).
     """
     # In place: for long transits of large images, the design takes most of the memory of a diagnosis.
     design -= np.einsum("nb,nbc->bc", weight / np.maximum(weight.sum(axis=0), 1e-300), design)

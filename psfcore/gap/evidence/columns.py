@@ -82,8 +82,15 @@ _FACTORS: tuple[Callable[[Matrix], Matrix], ...] = (
 class Responses:
     """The response S of Eq. (1) of one operator.
 
-    discs: (discs, cells, forms), DN/s, padded with zeros for discs with fewer cells. blocks: for each pointing (blocks,
-    forms), DN/s; zero if the operator does not reach the blocks. size: size_n of each image (images,).
+    Attributes
+    ----------
+    discs
+        The response of the discs (discs, cells, forms), DN/s, padded with zeros for discs with fewer cells.
+    blocks
+        The response of the blocks of each pointing (blocks, forms), DN/s; zero if the operator does not reach the
+        blocks.
+    size
+        The factor size_n of each image (images,).
     """
 
     discs: Matrix
@@ -200,7 +207,10 @@ class FieldColumns:
         """The change of an image by each form (forms, boxes along y, boxes along x), DN/s; for a gain relative to the
         image.
 
-        scene: of the image, on the boxes.
+        Parameters
+        ----------
+        scene
+            The scene of the image, on the boxes.
         """
         if operator == "outside":
             return self._outside
@@ -246,7 +256,13 @@ class FieldColumns:
     # --- one field -----------------------------------------------------------------------------------------
 
     def effect(self, field: Field, part: Sequence[int], likely: Sequence[float]) -> Effect:
-        """Some coefficients of a field as an effect. likely: the likely size of each coefficient."""
+        """Some coefficients of a field as an effect.
+
+        Parameters
+        ----------
+        likely
+            The likely size of each coefficient.
+        """
         weight, edge = self._modulation(field), self._evidence.box_px
         size = self._readouts if field.operator == "offset" else np.ones(len(weight))
         last: dict[int, Matrix] = {}
@@ -383,9 +399,14 @@ class FieldColumns:
 class FieldShape:
     """The shape of a field.
 
-    axes: the names of the axes of `at` (points, axes): x and y on the detector, time, or radius in the PSF; empty if
-    the field has no shape. values, sigma: (points,), in `unit`; for the optics a share of the light, along the radius
-    per octave.
+    Attributes
+    ----------
+    axes
+        The names of the axes of `at` (points, axes): x and y on the detector, time, or radius in the PSF; empty if the
+        field has no shape.
+    values, sigma
+        Value and error at each point (points,), in `unit`; for the optics a share of the light, along the radius per
+        octave.
     """
 
     axes: tuple[str, ...]
@@ -406,8 +427,14 @@ def another(family: str) -> str:
 
 
 def with_effect(evidence: Evidence, effect: Effect, discs: Matrix, blocks: Matrix) -> Evidence:
-    """The evidence with one more effect. discs: its columns (discs, cells, columns). blocks: (images, blocks,
-    columns).
+    """The evidence with one more effect.
+
+    Parameters
+    ----------
+    discs
+        The columns of the effect in the discs (discs, cells, columns).
+    blocks
+        The columns of the effect in the blocks (images, blocks, columns).
     """
     own = tuple(range(evidence.size, evidence.size + len(effect.parameters)))
     errors = np.concatenate([evidence.unocculted.errors, np.moveaxis(blocks, -1, 0)])

@@ -38,11 +38,11 @@ class EffectFit:
         Value, error and unit of each parameter; the key is "parameter", or "effect.parameter" if there are several
         effects.
     gain
-        The decrease of chi2.
+        The decrease of chi2 by the effects.
     p_value
         The p-value of the gain.
     step
-        The fit.
+        The fit of the columns of the effects.
     model
         The model that was fitted.
     """
@@ -68,8 +68,12 @@ def label_of(names: Sequence[str]) -> str:
 def fit_effects(model: LinearModel, effects: Sequence[Effect], *, any_sign: bool = False) -> EffectFit:
     """Fit the coordinates of the PSF together with these effects.
 
-    A parameter that must be positive is left out if its fitted value is not positive. any_sign: keep all parameters,
-    whatever their sign.
+    A parameter that must be positive is left out if its fitted value is not positive.
+
+    Parameters
+    ----------
+    any_sign
+        Whether to keep all parameters, whatever their sign.
     """
     columns = {
         column: (effect, parameter)

@@ -32,8 +32,16 @@ SMALLEST_SCALE, LARGEST_SCALE = 1.0, 3.0  # of `LinearModel.disc_scale` and `uno
 class ExpectedGap:
     """The residuals that remain if the model is right.
 
-    disc_scale: chi2 of the cells, per degree of freedom. unocculted_scale: chi2 of the unocculted blocks, per degree of
-    freedom. scale_error: relative error of disc_scale. residual_pct: rms residual of the discs' means, in percent.
+    Attributes
+    ----------
+    disc_scale
+        The chi2 of the cells, per degree of freedom.
+    unocculted_scale
+        The chi2 of the unocculted blocks, per degree of freedom.
+    scale_error
+        Relative error of `disc_scale`.
+    residual_pct
+        Rms residual of the discs' means, in percent.
     """
 
     disc_scale: float
@@ -43,7 +51,7 @@ class ExpectedGap:
 
 
 def simulated(view: View, seed: int) -> Transit:
-    """The transit with simulated images: the fitted model and its scenes, plus noise. seed: the seed of the noise."""
+    """The transit with simulated images: the fitted model and its scenes, plus noise from this seed."""
     solution = view.solution
     transit, optics = solution.transit, solution.optics
     frames = []
@@ -62,9 +70,14 @@ def linear_model_of(
     seed: int = 1,
     progress: Progress = lambda stage, step, steps: None,
 ) -> tuple[LinearModel, ExpectedGap]:
-    """The linear model of a fit with a library of effects, and the expected gap. seed: the seed of the simulation.
+    """The linear model of a fit with a library of effects, and the expected gap.
 
     Raises the errors of `gather` and of `psfcore.scatter.inversion.invert`.
+
+    Parameters
+    ----------
+    seed
+        The seed of the simulation.
     """
     evidence = gather(view.solution, library, view=view, progress=progress)
     expected = _expected_gap(view, evidence, seed, progress)
@@ -79,7 +92,7 @@ def linear_model_of(
 
 
 def _expected_gap(view: View, evidence: Evidence, seed: int, progress: Progress) -> ExpectedGap:
-    """The expected gap from one simulation. view, evidence: of the fit."""
+    """The expected gap from one simulation; `view` and `evidence` are those of the fit."""
     solution, told = view.solution, labelled(progress, "expected gap")
     again = invert(
         simulated(view, seed),

@@ -44,7 +44,17 @@ WEAKEST = 1e-9  # eigenvalues of a scaled normal matrix below this fraction of t
 
 @dataclass(frozen=True, eq=False)
 class Whitened:
-    """One disc, scaled to unit noise. residual: (cells,). jacobian: (columns, cells). white: the whitening matrix."""
+    """One disc, scaled to unit noise.
+
+    Attributes
+    ----------
+    residual
+        The residual of each cell (cells,).
+    jacobian
+        The change of the cells by one unit of each column (columns, cells).
+    white
+        The whitening matrix.
+    """
 
     index: int
     residual: Vector
@@ -56,7 +66,14 @@ class Whitened:
 class Step:
     """A linear fit of some columns (parameters).
 
-    values: the fitted parameters. covariance: their covariance. fall: the decrease of chi2 by all columns together.
+    Attributes
+    ----------
+    values
+        The fitted parameters.
+    covariance
+        The covariance of these parameters.
+    fall
+        The decrease of chi2 by all columns together.
     """
 
     columns: tuple[int, ...]
@@ -69,8 +86,14 @@ class Step:
 class LinearModel:
     """Eq. (1) for the evidence of a transit.
 
-    floor: f of Eq. (2). disc_scale, unocculted_scale: chi2 per degree of freedom that the discs and the unocculted
-    blocks have without a gap. scale_error: relative error of disc_scale.
+    Attributes
+    ----------
+    floor
+        The fraction f of Eq. (2).
+    disc_scale, unocculted_scale
+        Chi2 per degree of freedom that the discs and the unocculted blocks have without a gap.
+    scale_error
+        Relative error of disc_scale.
     """
 
     evidence: Evidence
@@ -90,9 +113,14 @@ class LinearModel:
         return tuple(out)
 
     def equations(self, images: Sequence[int] | None = None) -> tuple[Matrix, Vector]:
-        """The normal matrix and the right-hand side (`score`) of all columns. images: the images to use; None: all.
+        """The normal matrix and the right-hand side (`score`) of all columns.
 
         Each result is computed once and kept.
+
+        Parameters
+        ----------
+        images
+            The images to use; None: all.
         """
         key = None if images is None else tuple(images)
         if key not in self._equations:
@@ -114,8 +142,12 @@ class LinearModel:
         return {}
 
     def fit(self, columns: Sequence[int], equations: tuple[Matrix, Vector] | None = None) -> Step:
-        """Fit the coordinates of the PSF and these columns. equations: a result of `equations` (None: for all
-        images).
+        """Fit the coordinates of the PSF and these columns.
+
+        Parameters
+        ----------
+        equations
+            A result of `equations` (None: for all images).
         """
         here = [*self.evidence.base, *columns]
         normal, score = self.equations() if equations is None else equations
@@ -134,7 +166,10 @@ class LinearModel:
         """How much smaller the fitted values become if the prior also applies to the amounts that were subtracted
         before the fit.
 
-        taken_out: the subtracted amounts, for each column of the fit.
+        Parameters
+        ----------
+        taken_out
+            The subtracted amounts, for each column of the fit.
         """
         return np.asarray(step.covariance @ (self._prior[list(step.columns)] * taken_out))
 

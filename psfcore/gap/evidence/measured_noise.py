@@ -34,8 +34,12 @@ TRUSTED = 0.15  # the stated noise is used if the ratio of variances differs fro
 class MeasuredNoise:
     """The noise that the images show.
 
-    noise: photon gain and read noise from the fitted line. ratio: measured variance divided by stated variance, the
-    median over all blocks.
+    Attributes
+    ----------
+    noise
+        Photon gain and read noise from the fitted line.
+    ratio
+        Measured variance divided by stated variance, the median over all blocks.
     """
 
     noise: Noise

@@ -44,8 +44,13 @@ AT_ONCE = 16  # number of fields that are processed together
 class ImageInfo:
     """The properties of one image: its values on the axes.
 
-    scattering_distance_px: nan if the fit did not use the image. described: whether the neighbouring images in time
-    show the scene around the occulter; the fitted position of the occulter is then reliable.
+    Attributes
+    ----------
+    scattering_distance_px
+        The scattering distance; nan if the fit did not use the image.
+    described
+        Whether the neighbouring images in time show the scene around the occulter; the fitted position of the occulter
+        is then reliable.
     """
 
     file: str
@@ -63,8 +68,14 @@ class ImageInfo:
 class Prior:
     """The prior of the parameter of each column, a Gaussian (columns,). The coordinates of the PSF have no prior.
 
-    likely: the largest plausible size; infinite for the coordinates of the PSF. positive: whether the parameter cannot
-    be negative. field: whether it is a coefficient of a random field.
+    Attributes
+    ----------
+    likely
+        The largest plausible size of the parameter; infinite for the coordinates of the PSF.
+    positive
+        Whether the parameter cannot be negative.
+    field
+        Whether the parameter is a coefficient of a random field.
     """
 
     likely: Vector
@@ -143,10 +154,14 @@ def gather(
     view: View | None = None,
     progress: Progress = lambda stage, step, steps: None,
 ) -> Evidence:
-    """Compute the evidence of a solution for a library of effects. view: the view of the solution, if it exists
-    already.
+    """Compute the evidence of a solution for a library of effects.
 
     Raises DataError "bad-effects" if an added effect fails.
+
+    Parameters
+    ----------
+    view
+        The view of the solution, if it exists already.
     """
     view = view or View(solution)
     base = tuple(range(solution.inversion.coordinates.size))
@@ -248,9 +263,17 @@ def residuals_at(
     """The evidence of another PSF for the same transit: its residuals and its Jacobian of the PSF, with the Jacobian of
     the effects of `evidence`.
 
-    The Jacobian of the effects takes most of the time of `gather`, and hardly differs. view: of the other PSF. columns:
-    the columns after the base that are kept; changes: the changes that belong to them, for discs whose cells have
-    moved. The result has no effects. Discs that `evidence` lacks are left out.
+    The Jacobian of the effects takes most of the time of `gather`, and hardly differs. The result has no effects. Discs
+    that `evidence` lacks are left out.
+
+    Parameters
+    ----------
+    view
+        The view of the other PSF.
+    columns
+        The columns after the base that are kept.
+    changes
+        The changes that belong to these columns, for discs whose cells have moved.
     """
     rows = [*evidence.base, *columns]
     part = set(view.solution.part)

@@ -95,8 +95,13 @@ class PlaceSearch:
     def kernels(self, kernels: Sequence[Matrix]) -> Vector:
         """The gain, Eq. (2), of each change of the PSF: (kernels,).
 
-        kernels: changes of the PSF [y, x], with the centre at n // 2. The search uses the means of the discs and, for
-        light that moves near a disc, also its cells, Eq. (3).
+        The search uses the means of the discs and, for light that moves near a disc, also the cells of this disc, Eq.
+        (3).
+
+        Parameters
+        ----------
+        kernels
+            Changes of the PSF [y, x], with the centre at n // 2.
         """
         return self._gain(self._of_discs(self._to_displacements, kernels), self._of_cells(kernels))
 
@@ -160,9 +165,14 @@ class PlaceSearch:
     def _gain(self, means: Matrix, cells: Matrix | None = None, *, least: float = 0.0) -> Vector:
         """Eq. (2) for several templates (templates,).
 
-        means: T of the means of the discs (discs, templates). cells: T of the cells (cells, templates), in units of the
-        noise; None: use the means alone. least: a template gains 0 if its sum T^2 is below this fraction of the largest
-        sum T^2.
+        Parameters
+        ----------
+        means
+            T of the means of the discs (discs, templates).
+        cells
+            T of the cells (cells, templates), in units of the noise; None: use the means alone.
+        least
+            A template gains 0 if its sum T^2 is below this fraction of the largest sum T^2.
         """
         responses, left = means / self._sigma[:, None], self._of_means
         if cells is not None:
@@ -189,7 +199,12 @@ def distinguished(gains: Vector) -> float:
 class _Unabsorbed:
     """The component of residuals and responses that a change of the PSF cannot absorb, in units of the noise.
 
-    absorbed: the responses to the coordinates of the PSF (n, coordinates). residual: (n,).
+    Parameters
+    ----------
+    absorbed
+        The responses to the coordinates of the PSF (n, coordinates).
+    residual
+        The residuals (n,).
     """
 
     def __init__(self, absorbed: Matrix, residual: Vector) -> None:
@@ -206,11 +221,19 @@ class _Unabsorbed:
 
 @dataclass(frozen=True, eq=False)
 class NearDisc:
-    """The cells of one disc, in a patch around it.
+    """The cells of one disc, in a patch around it. All fields after `left` are in units of the noise of the cells,
+    without the mean of the disc.
 
-    top, left: the first pixel of the patch. planes: the sensitivities of the cells (cells, y, x). residual: their
-    residuals (cells,). to_displacements: C of Eq. (3) (cells, displacements y, displacements x). All are in units of
-    the noise of the cells, without the mean of the disc.
+    Attributes
+    ----------
+    top, left
+        The first pixel of the patch.
+    planes
+        The sensitivities of the cells (cells, y, x).
+    residual
+        The residuals of the cells (cells,).
+    to_displacements
+        The array C of Eq. (3) (cells, displacements y, displacements x).
     """
 
     top: int
@@ -222,7 +245,10 @@ class NearDisc:
     def of_kernel(self, change: Matrix) -> Vector:
         """The response of each cell to a change of the PSF, T of Eq. (3), (cells,).
 
-        change: the change of the PSF [y, x], with the centre at [n // 2, n // 2].
+        Parameters
+        ----------
+        change
+            The change of the PSF [y, x], with the centre at [n // 2, n // 2].
         """
         near = crop_or_pad(change, 2 * NEAR_REACH_PX + 1).astype(np.float32)
         return np.asarray(np.tensordot(self.to_displacements, near, axes=2), dtype=np.float64)
@@ -277,8 +303,12 @@ def _sums(
     """Eq. (1) for displacements up to `reach` along each axis: (planes, 2 reach + 1, 2 reach + 1), with d = 0 in the
     middle.
 
-    planes: q (planes, y, x); their first pixel is the pixel [top, left] of the image. The image is 0 outside its
-    pixels.
+    The image is 0 outside its pixels.
+
+    Parameters
+    ----------
+    planes
+        The planes q (planes, y, x); their first pixel is the pixel [top, left] of the image.
     """
     ny, nx = planes.shape[1:]
     return correlations(

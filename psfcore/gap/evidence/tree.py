@@ -26,8 +26,16 @@ SPOT = 0.1  # width of the bumps of a change at one place
 
 @dataclass(frozen=True)
 class Family:
-    """A family of causes. words: its name in text. settled_by: the observation that shows such a cause. axes: of the
-    report, along which it varies.
+    """A family of causes.
+
+    Attributes
+    ----------
+    words
+        The name of the family in text.
+    settled_by
+        The observation that shows such a cause.
+    axes
+        The axes of the report along which the cause varies.
     """
 
     name: str
@@ -176,8 +184,14 @@ FAMILIES: dict[str, Family] = {
 
 @dataclass(frozen=True)
 class Field:
-    """A free field: the operator and the modulation of `columns`. width: of its bumps. pointing: of a change in one
-    pointing.
+    """A free field: the operator and the modulation of `columns`.
+
+    Attributes
+    ----------
+    width
+        The width of the bumps of the modulation.
+    pointing
+        The number of the pointing, for a change in one pointing.
     """
 
     family: str
@@ -205,8 +219,16 @@ class Field:
 
 
 def fields_of(pointings: Sequence[int], *, exposures: bool, kinds: bool) -> list[Field]:
-    """The fields that images can show. pointings: the numbers of the pointings. exposures: whether exposure times
-    differ. kinds: whether exposure times or gain modes differ.
+    """The fields that images can show.
+
+    Parameters
+    ----------
+    pointings
+        The numbers of the pointings.
+    exposures
+        Whether exposure times differ.
+    kinds
+        Whether exposure times or gain modes differ.
     """
     found = []
     for operator in ("light", "gain", *(["offset"] if exposures else [])):

@@ -98,10 +98,16 @@ class UnoccultedBlocks:
     def equations(
         self, columns: Sequence[int], images: Sequence[int] | None = None, *, width: float | None = None
     ) -> UnoccultedEquations:
-        """The normal equations of these columns. images: the images to use; None: all. width: the width of the prior of
-        g_n; None: `gain_width`.
+        """The normal equations of these columns.
 
         Scene and brightness are free parameters.
+
+        Parameters
+        ----------
+        images
+            The images to use; None: all.
+        width
+            The width of the prior of g_n; None: `gain_width`.
         """
         every = range(len(self.part)) if images is None else images
         chosen = np.array([n for n in every if self.part[n]], dtype=int)
@@ -140,12 +146,16 @@ class UnoccultedBlocks:
         )
 
     def held_out(self, columns: Sequence[int], n: int, fitted: Sequence[int]) -> tuple[Vector, Matrix]:
-        """The held-out image n minus the scene of the fitted images, and the Jacobian of this difference, in units of
-        the noise.
+        """The held-out image n minus the scene of the fitted images (values,), and the Jacobian of this difference
+        (columns, values), in units of the noise.
 
-        fitted: the images that give the scene. The two results have the shapes (values,) and (columns, values). They
-        contain the values of the blocks, followed by the brightness in units of `gain_width`; nothing if the scene is
-        not known.
+        The two results contain the values of the blocks, followed by the brightness in units of `gain_width`; nothing
+        if the scene is not known.
+
+        Parameters
+        ----------
+        fitted
+            The images that give the scene.
         """
         errors = self.errors[list(columns)]
         here = [k for k in fitted if self.pointing[k] == self.pointing[n] and self.part[k]]
@@ -173,15 +183,15 @@ class UnoccultedEquations:
     Attributes
     ----------
     normal
-        The normal matrix.
+        The normal matrix of the columns.
     score
-        The right-hand side.
+        The right-hand side of the equations.
     chi2
         The chi2 after the fit of scene and brightness alone, without the columns.
     freedom
-        Degrees of freedom of this chi2, if the brightness of every image is free.
+        Degrees of freedom of `chi2`, if the brightness of every image is free.
     independent
-        The same with the prior of the brightness, which leaves it less free.
+        Degrees of freedom of `chi2` with the prior of the brightness, which leaves the brightness less free.
     gains
         The fitted g_n of each image, without the columns.
     """
@@ -212,8 +222,12 @@ def blocks(plane: NDArray[np.floating]) -> Vector:
 
 
 def unocculted_blocks(view: View, columns: int, progress: Progress) -> UnoccultedBlocks:
-    """The blocks of all images. columns: the number of columns of `errors`. `errors` is zero; the caller fills it
-    in.
+    """The blocks of all images. `errors` of the result is zero; the caller fills it in.
+
+    Parameters
+    ----------
+    columns
+        The number of columns of `errors`.
     """
     transit, edge = view.solution.transit, block_px(view.solution.transit.shape)
     levels, variance, free, means = [], [], [], []

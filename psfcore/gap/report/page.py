@@ -42,10 +42,15 @@ MOST_HYPOTHESES = 8
 
 
 def gap_page(found: Diagnosis, report: GapReport) -> Page:
-    """The page of a diagnosis. report: its report (schema gap/3).
+    """The page of a diagnosis.
 
     The optional entry "provenance" of the report states the software, the libraries, the seed and the PSF at which the
     fit started.
+
+    Parameters
+    ----------
+    report
+        The report of this diagnosis (schema gap/3).
     """
     version = report.get("provenance", {}).get("software_version", "")
     optical = [

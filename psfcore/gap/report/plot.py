@@ -359,7 +359,7 @@ def largest_residual(found: Diagnosis) -> int:
 
 
 def simulated_of(found: Diagnosis, n: int, *, with_answer: bool = False) -> Plane:
-    """The model image of image n [y, x], DN/s. with_answer: whether to add the change by the named effects."""
+    """The model image of image n [y, x], DN/s; `with_answer` adds the change by the named effects."""
     raw = found.solution.transit.frames[n].pixels
     solution = found.corrected.solution if with_answer and found.corrected else found.solution
     seen = solution.optics.field(solution.optics.convolve(solution.blanked_scene(n)))

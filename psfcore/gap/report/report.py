@@ -173,7 +173,10 @@ def _interval(interval: Interval | None) -> IntervalJson | None:
 def _values(inversion: Inversion, covariance: NDArray[np.float64]) -> dict[str, ParameterJson]:
     """The parameters of the shape, with errors that contain the floor of the linear model.
 
-    covariance: the covariance of the coordinates, from the linear model.
+    Parameters
+    ----------
+    covariance
+        The covariance of the coordinates, from the linear model.
     """
     sigma = np.sqrt(np.diag(covariance))
     return {
@@ -257,9 +260,15 @@ def _residuals(held_out: HeldOut | None) -> dict[int, tuple[float, float, float 
 class UnoccultedSize:
     """The gap in the unocculted field.
 
-    before, after: the rms residual of its blocks in held-out images, in units of the noise, without and with the told
-    causes; 1 if only noise remains, None if no image can be held out. noise_pct: the median noise of a block, in
-    percent of its light. shows_the_gap: whether it shows the gap and the discs do not.
+    Attributes
+    ----------
+    before, after
+        The rms residual of the blocks of the field in held-out images, in units of the noise, without and with the told
+        causes; 1 if only noise remains, None if no image can be held out.
+    noise_pct
+        The median noise of a block, in percent of its light.
+    shows_the_gap
+        Whether the unocculted field shows the gap and the discs do not.
     """
 
     before: float | None
@@ -411,7 +420,10 @@ def axes_words(where: Sequence[Axis]) -> str:
 def pointing_shares(found: Diagnosis, *, unocculted: bool = False) -> dict[int, float]:
     """The share of each pointing in the chi2 beyond noise, the largest first; empty if there is none.
 
-    unocculted: of the blocks of the unocculted field, in held-out images; else of the discs.
+    Parameters
+    ----------
+    unocculted
+        Whether the chi2 is that of the blocks of the unocculted field in held-out images; else it is that of the discs.
     """
     infos = found.evidence.image_info
     if unocculted and found.residual is not None:
@@ -596,7 +608,12 @@ def shown_by_blocks(found: Diagnosis) -> bool:
 
 def promise_words(calibration: Mapping[str, Any]) -> str:
     """How often the alternatives contained a true cause: where the level comes from, and with effects of another
-    author. calibration: of the report.
+    author.
+
+    Parameters
+    ----------
+    calibration
+        The entry ``calibration`` of the report.
     """
     other = calibration["another_author"]
     low, high = other["ci95"]

@@ -84,7 +84,13 @@ UNKNOWN = "unknown"
 
 @dataclass(frozen=True)
 class Alternative:
-    """One label of a cause. probability: that it acts, if there is a gap."""
+    """One label of a cause.
+
+    Attributes
+    ----------
+    probability
+        The probability that this cause acts, if there is a gap.
+    """
 
     family: Family
     effect: str | None
@@ -131,9 +137,9 @@ class Answer:
     Attributes
     ----------
     causes
-        The first cause, and those that act beside it; empty if no gap is detected.
+        The first cause, and the causes that act beside it; empty if no gap is detected.
     verdict, named
-        As in the table above.
+        Verdict and named causes, as in the table above.
     none
         The probability of no cause.
     hypotheses
@@ -143,7 +149,7 @@ class Answer:
     closed
         The closed form with the final noise.
     level
-        The probability of a group.
+        The probability that at least one label of the group of a cause acts.
     """
 
     causes: tuple[Cause, ...]
@@ -173,7 +179,13 @@ def label_of(form: Form) -> Label:
 
 
 def answer_of(model: LinearModel, level: float) -> Answer:
-    """The answer for a linear model. level: the probability of a group of alternatives."""
+    """The answer for a linear model.
+
+    Parameters
+    ----------
+    level
+        The probability that at least one label of the group of a cause acts.
+    """
     weighed = _Weighed(ClosedForm(model))
     best = weighed.best
     exact = weighed.variants_of(best)
@@ -350,7 +362,13 @@ def _of_labels(shares: Mapping[Labels, float]) -> dict[Label, float]:
 
 
 def causes_of(shares: Mapping[Labels, float], level: float) -> tuple[Cause, ...]:
-    """The causes of the answer. shares: the probability of each set of labels."""
+    """The causes of the answer.
+
+    Parameters
+    ----------
+    shares
+        The probability of each set of labels.
+    """
     none = shares.get(frozenset(), 0.0)
     if none * (1 + FLOOR) > 1:
         return ()

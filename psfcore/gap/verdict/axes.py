@@ -38,9 +38,17 @@ SUSPECT = 2  # number of pointings that the report names
 class Axis:
     """How much of the gap varies along one axis, and where the gap is largest.
 
-    share: fraction, 0 to 1. alone: the decrease of chi2 by this axis alone. at: the pointings with the largest
-    residuals, and the range of the axis in them. of_best: the axis comes first because the best effect varies along it;
-    by p-value and share another one would.
+    Attributes
+    ----------
+    share
+        The share of the gap that varies along the axis, 0 to 1.
+    alone
+        The decrease of chi2 by this axis alone.
+    at
+        The pointings with the largest residuals, and the range of the axis in them.
+    of_best
+        Whether the axis comes first because the best effect varies along it, although p-value and share would put
+        another axis first.
     """
 
     name: str
@@ -66,11 +74,15 @@ def ranked_axes(
 ) -> tuple[Axis, ...]:
     """All axes, the strongest first. Significant axes come before the others; then the share decides.
 
-    favoured: the axes of the best effect. They come first if they explain at least the fraction AS_GOOD of what the
-    best axis explains, because more data than the position on the track identified this effect. explained: the fit of
-    an effect that explains the gap. If `explained` is given, the shares are computed from the part of the residuals
-    that this effect explains. This part is computed from the fitted model, so it does not contain the pixel noise of
-    the residuals.
+    Parameters
+    ----------
+    favoured
+        The axes of the best effect. They come first if they explain at least the fraction AS_GOOD of what the best axis
+        explains, because more data than the position on the track identified this effect.
+    explained
+        The fit of an effect that explains the gap. If `explained` is given, the shares are computed from the part of
+        the residuals that this effect explains. This part is computed from the fitted model, so it does not contain the
+        pixel noise of the residuals.
     """
     designs = _designs(model.evidence)
     names, spans, columns = list(designs), {}, 0
@@ -204,9 +216,12 @@ def _of_unocculted(model: LinearModel, designs: dict[str, list[Matrix]]) -> tupl
 
 
 def _falls(normal: Matrix, scores: Matrix, columns: list[int]) -> Vector:
-    """The decrease of chi2 by these columns, minus their number, at least 0.
+    """The decrease of chi2 by these columns, minus their number, at least 0: one value for each flip.
 
-    scores: right-hand sides of the normal equations (flips, columns). The result has one value for each flip.
+    Parameters
+    ----------
+    scores
+        Right-hand sides of the normal equations (flips, columns).
     """
     if not columns:
         return np.zeros(scores.shape[0])
@@ -218,7 +233,7 @@ def _falls(normal: Matrix, scores: Matrix, columns: list[int]) -> Vector:
 
 
 def shapley(names: list[str], worth: dict[tuple[str, ...], float]) -> dict[str, float]:
-    """The Shapley value of each name. worth: the decrease of chi2 by each subset of the names."""
+    """The Shapley value of each name, from the decrease of chi2 by each subset of the names (`worth`)."""
     out = dict.fromkeys(names, 0.0)
     for chosen, value in worth.items():
         for name in (one for one in names if one not in chosen):

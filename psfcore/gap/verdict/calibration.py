@@ -36,7 +36,10 @@ ANOTHER_AUTHOR: Mapping[str, object] = {"causes": 19, "left_pct": 10, "covered":
 class Calibration:
     """The probabilities at which the answers to simulated cases first contained a true cause.
 
-    about: how the cases were made: seed, version, command, and the data for which the coverage holds.
+    Attributes
+    ----------
+    about
+        How the cases were made: seed, version, command, and the data for which the coverage holds.
     """
 
     levels: tuple[float, ...]

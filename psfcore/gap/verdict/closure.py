@@ -76,9 +76,9 @@ class HeldOut:
     residual_pct
         The mean of the disc, simulated minus observed, divided by the observed mean.
     noise_pct
-        The error of this residual, including the error of the fit.
+        The error of `residual_pct`, including the error of the fit.
     deviance
-        Eq. (4) of each fold; the key is the tuple of its held-out images.
+        The deviance, Eq. (4), of each fold; the key is the tuple of the held-out images of the fold.
     spread
         For each fold, the parts of chi2 that independent errors of its fit add on average, in the discs and in discs
         and blocks together.
@@ -122,7 +122,10 @@ def pointings(model: LinearModel) -> tuple[Fold, ...]:
 def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold]) -> HeldOut | None:
     """Predict the held-out images of every fold from a fit to its other images. None if no fold can be fitted.
 
-    columns: the parameters of effects that are fitted together with the PSF (columns of the Jacobian).
+    Parameters
+    ----------
+    columns
+        The parameters of effects that are fitted together with the PSF (columns of the Jacobian).
     """
     evidence, base = model.evidence, len(model.evidence.base)
     by_index = {disc.index: k for k, disc in enumerate(evidence.discs)}
@@ -172,7 +175,7 @@ def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold])
 
 
 def _error(jacobian: Vector, covariance: Vector) -> float:
-    """trace(J Cov J^T). jacobian: (parameters, n)."""
+    """trace(J Cov J^T) for a Jacobian (parameters, n)."""
     return float(np.einsum("ki,kl,li->", jacobian, covariance, jacobian))
 
 
@@ -180,13 +183,24 @@ def _spread(along: Vector) -> Vector:
     """The eigenvalues of J Cov J^T (parameters,): the chi2 that errors of the parameters add is the sum of these times
     squares of standard normal variables.
 
-    along: (parameters, n), the change by one standard deviation of each independent error, in units of the noise.
+    Parameters
+    ----------
+    along
+        The change (parameters, n) by one standard deviation of each independent error, in units of the noise.
     """
     return np.asarray(np.maximum(np.linalg.eigvalsh(along @ along.T), 0.0))
 
 
 def _deviance(left: Vector, along: Vector) -> float:
-    """Eq. (4). left: residuals (n,) in units of the noise. along: as for `_spread`."""
+    """The deviance, Eq. (4).
+
+    Parameters
+    ----------
+    left
+        The residuals (n,) in units of the noise.
+    along
+        The change (parameters, n) by one standard deviation of each independent error, in units of the noise.
+    """
     inner = np.eye(along.shape[0]) + along @ along.T
     projected = along @ left
     return float(left @ left - projected @ np.linalg.solve(inner, projected) + np.linalg.slogdet(inner)[1])
@@ -195,8 +209,12 @@ def _deviance(left: Vector, along: Vector) -> float:
 def closure(
     before: HeldOut, after: HeldOut, rng: np.random.Generator, scale_error: float = 0.0
 ) -> Interval | None:
-    """Eq. (1) with its 90 % interval; None if there is no gap. scale_error: relative error of the scale of chi2 (noise
-    variance).
+    """The closure, Eq. (1), with its 90 % interval; None if there is no gap.
+
+    Parameters
+    ----------
+    scale_error
+        Relative error of the scale of chi2 (noise variance).
     """
     # A fold is skipped if it has too few images for the number of fitted parameters, so the images can differ.
     common, spread = sorted(set(before.images) & set(after.images)), after.spread.values()
@@ -245,9 +263,14 @@ def fall(before: HeldOut, after: HeldOut) -> float:
 
 
 def gap(residual_pct: Vector, noise_pct: Vector, rng: np.random.Generator) -> Interval:
-    """Eq. (3) with its 90 % interval. residual_pct, noise_pct: of each image, as in `HeldOut`.
+    """The gap, Eq. (3), with its 90 % interval.
 
-    Its upper end is never below the largest gap that the noise could hide.
+    The upper end of the interval is never below the largest gap that the noise could hide.
+
+    Parameters
+    ----------
+    residual_pct, noise_pct
+        Residual and noise of each image, as in `HeldOut`.
     """
     squares = residual_pct**2 - noise_pct**2
     chosen = rng.integers(0, squares.size, (RESAMPLES, squares.size))

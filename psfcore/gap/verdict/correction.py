@@ -40,8 +40,14 @@ WORSE_SHARE = 0.05
 class Corrected:
     """A full refit with effects in the model.
 
-    values: value, error and unit of each parameter of the effects; the value is summed over all rounds. model: the
-    linear model at the refit. rounds: number of rounds made.
+    Attributes
+    ----------
+    values
+        Value, error and unit of each parameter of the effects; the value is summed over all rounds.
+    model
+        The linear model at the refit.
+    rounds
+        Number of rounds that were made.
     """
 
     effects: tuple[Effect, ...]
@@ -76,7 +82,9 @@ class Corrected:
 
 
 def images_without(transit: Transit, view: View, effects: Sequence[Effect], theta: Vector) -> Transit:
-    """The transit, with the changes by these effects subtracted from its images. theta: the parameters, in order."""
+    """The transit, with the changes by these effects subtracted from its images; `theta` holds the parameters of the
+    effects, in order.
+    """
     changes = [change for effect in effects for change in effect.changes(view)]
     frames = []
     for n, frame in enumerate(transit.frames):
@@ -101,8 +109,13 @@ def add_to_model(
 
     A step that changes the PSF too much is shortened as a whole.
 
-    view: the view of the solution, if it exists already. Raises the errors of `invert` if the first round fails,
-    DataError "effect-unseen" if the images do not constrain the effects, and "bad-effects" if an added effect fails.
+    Raises the errors of `invert` if the first round fails, DataError "effect-unseen" if the images do not constrain the
+    effects, and "bad-effects" if an added effect fails.
+
+    Parameters
+    ----------
+    view
+        The view of the solution, if it exists already.
     """
     transit, shape = solution.transit, solution.inversion.shape
     # An effect that searches for a position keeps the position that it found first.
@@ -187,9 +200,15 @@ def _with_old_jacobian(model: LinearModel, view: View, held: Sequence[Effect]) -
 
 
 def _fit_remaining(model: LinearModel, held: Sequence[Effect], out: Vector) -> tuple[EffectFit, Vector]:
-    """The fit of effects to images from which a part of them was subtracted; and the parameters: both parts together.
+    """The fit of effects to images from which a part of these effects was subtracted; and the parameters: both parts
+    together.
 
-    model: the linear model of these images. out: the part that was subtracted.
+    Parameters
+    ----------
+    model
+        The linear model of these images.
+    out
+        The parameters of the part that was subtracted.
     """
     left = fit_effects(model, model.evidence.effects, any_sign=True)
     found = np.array([value for value, _, _ in left.values.values()])

@@ -48,8 +48,14 @@ RMS = "rms"  # the parameter of a random field: the standard deviation of its co
 class ParameterLimits:
     """The limits of one parameter, in its unit.
 
-    likely: the largest plausible size. found_90: None if no strength would be found. excluded_95: None before there are
-    data.
+    Attributes
+    ----------
+    likely
+        The largest plausible size of the parameter.
+    found_90
+        The smallest strength that is found with a probability of 90 %; None if no strength would be found.
+    excluded_95
+        The 95 % quantile of the strength; None before there are data.
     """
 
     name: str
@@ -59,7 +65,9 @@ class ParameterLimits:
     excluded_95: float | None
 
     def as_json(self, *, observed: bool = True) -> ParameterLimitsJson:
-        """The limits for a report. observed: whether there are data, which can exclude strengths."""
+        """The limits for a report; with `excluded_95` only if there are data (`observed`), because only data can
+        exclude strengths.
+        """
         content: ParameterLimitsJson = {"unit": self.unit, "found_90": self.found_90}
         return {**content, "excluded_95": self.excluded_95} if observed else content
 
@@ -97,7 +105,13 @@ class EffectLimits:
 
 @dataclass(frozen=True)
 class Alike:
-    """Two effects that these data cannot tell apart. would_separate: an observation that could tell them apart."""
+    """Two effects that these data cannot tell apart.
+
+    Attributes
+    ----------
+    would_separate
+        An observation that could tell them apart.
+    """
 
     pair: tuple[str, str]
     distance: float
@@ -108,8 +122,14 @@ class Alike:
 class Limits:
     """The limits of all effects, by name.
 
-    distances: the distance of every pair of effects, in sigma. alike: the pairs that the data cannot tell apart.
-    untestable: the reasons why effects cannot be tested, by name.
+    Attributes
+    ----------
+    distances
+        The distance of every pair of effects, in sigma.
+    alike
+        The pairs that the data cannot tell apart.
+    untestable
+        The reasons why effects cannot be tested, by name.
     """
 
     effects: Mapping[str, EffectLimits]
@@ -118,7 +138,13 @@ class Limits:
     untestable: Mapping[str, str]
 
     def after_refit(self, effect: Effect, fitted: Mapping[str, tuple[float, float]]) -> Limits:
-        """The same limits, with excluded_95 of an effect from a full refit. fitted: value and error by parameter."""
+        """The same limits, with excluded_95 of an effect from a full refit.
+
+        Parameters
+        ----------
+        fitted
+            Value and error of each parameter, by its name.
+        """
         new = {
             p.name: upper_limit(*fitted[p.name], p.positive) for p in effect.parameters if p.name in fitted
         }
@@ -127,7 +153,13 @@ class Limits:
         return replace(self, effects={**self.effects, effect.name: own})
 
     def as_json(self, *, observed: bool = True) -> LimitsJson:
-        """`limits`, `alike` and `untestable` as in a report. observed: as in `ParameterLimits`."""
+        """`limits`, `alike` and `untestable` as in a report.
+
+        Parameters
+        ----------
+        observed
+            Whether there are data, which can exclude strengths.
+        """
         return {
             "limits": {name: one.as_json(observed=observed) for name, one in self.effects.items()},
             "alike": [vars(one) | {"pair": list(one.pair)} for one in self.alike],
@@ -136,8 +168,14 @@ class Limits:
 
 
 def limits(closed: ClosedForm, beside: Sequence[Variant] = (), *, observed: bool = True) -> Limits:
-    """The limits of all effects. beside: the told causes. observed: whether the data are real; only then they can
-    exclude strengths.
+    """The limits of all effects.
+
+    Parameters
+    ----------
+    beside
+        The told causes, which act beside the effects.
+    observed
+        Whether the data are real; only then they can exclude strengths.
     """
     evidence = closed.model.evidence
     own = {
@@ -172,8 +210,12 @@ def limits(closed: ClosedForm, beside: Sequence[Variant] = (), *, observed: bool
 
 
 def _found(closed: ClosedForm, form: Form, k: int | None, least: float) -> float | None:
-    """found_90 of parameter k of an effect; of the standard deviation of a random field (None). least: the smallest ln
-    E that is found.
+    """found_90 of parameter k of an effect, or, if k is None, of the standard deviation of a random field.
+
+    Parameters
+    ----------
+    least
+        The smallest ln E at which an effect is found.
     """
     normal = closed.normal(form.columns)
     values, vectors = np.linalg.eigh(normal)
@@ -201,8 +243,12 @@ def _found(closed: ClosedForm, form: Form, k: int | None, least: float) -> float
 
 
 def _first_found(margin: Callable[[float], float], unit: float, most: float) -> float | None:
-    """The smallest strength, up to `most`, for which `margin` is at least 0; None if there is none. unit: the error of
-    the strength.
+    """The smallest strength, up to `most`, for which `margin` is at least 0; None if there is none.
+
+    Parameters
+    ----------
+    unit
+        The error of the strength.
     """
     if most <= WEAKEST_TRIED * unit:
         return None

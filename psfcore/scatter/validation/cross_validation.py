@@ -67,7 +67,15 @@ PARTING_SIGMAS = 3.0
 
 @dataclass(frozen=True)
 class FoldSample:
-    """One fold of one run. counts: how many times each image counts. held_out: indices of the held-out images."""
+    """One fold of one run.
+
+    Attributes
+    ----------
+    counts
+        The number of times that each image counts.
+    held_out
+        Indices of the held-out images.
+    """
 
     run: int
     fold: int
@@ -79,8 +87,14 @@ class FoldSample:
 class FoldShells:
     """The scattered light in each shell for one sample, as a fraction of all light.
 
-    free: light of the free fit. law: light of the formula. excess_sigma: error of the excess within the outer edge of
-    each shell, from the covariance of the free fit.
+    Attributes
+    ----------
+    free
+        Light of the free fit.
+    law
+        Light of the formula.
+    excess_sigma
+        Error of the excess within the outer edge of each shell, from the covariance of the free fit.
     """
 
     free: tuple[float, ...]
@@ -92,8 +106,14 @@ class FoldShells:
 class FoldFit:
     """The PSF fitted to one sample.
 
-    curve_pct: C(R) = 100 (1 - encircled energy) of the total PSF. held_out_pct: the residual of each held-out image, in
-    percent of the observed mean; the keys are the images' indices. shells: None if the formula is not isotropic.
+    Attributes
+    ----------
+    curve_pct
+        The curve C(R) = 100 (1 - encircled energy) of the total PSF.
+    held_out_pct
+        The residual of each held-out image, in percent of the observed mean; the keys are the indices of the images.
+    shells
+        The light in each shell; None if the formula is not isotropic.
     """
 
     run: int
@@ -201,8 +221,14 @@ def exact_fit(
 ) -> FoldFit:
     """The PSF of one sample, from a separate fit, and the residuals of the held-out images with this PSF.
 
-    solution: the fit to all images. progress: called before each image is processed, so that a worker can send a
-    heartbeat or stop the fit. Raises the errors of `shared_fits` and `invert`.
+    Raises the errors of `shared_fits` and `invert`.
+
+    Parameters
+    ----------
+    solution
+        The fit to all images.
+    progress
+        Function that is called before each image is processed, so that a worker can send a heartbeat or stop the fit.
     """
     start = solution.inversion.coordinates + shared_step(solution, sample)
     fitted, at = refit(solution, sample.counts, start, progress=progress)
@@ -334,8 +360,14 @@ def limits_json(limits: Matrix) -> dict[str, object]:
 class Excess:
     """The light of the free fit within a distance minus the light of the formula within the same distance.
 
-    points: the difference in percent of all light. sigma: error of `points`. of_formula_pct: the same difference in
-    percent of the light that the formula puts within the distance.
+    Attributes
+    ----------
+    points
+        The difference in percent of all light.
+    sigma
+        Error of `points`.
+    of_formula_pct
+        The same difference in percent of the light that the formula puts within the distance.
     """
 
     within_px: float
@@ -400,7 +432,13 @@ class Bands:
 
 
 def bands(fits: tuple[FoldFit, ...], radii_px: Vector) -> Bands:
-    """Medians and percentiles over the samples. radii_px: the radii at which the fits' curves C(R) are given."""
+    """Medians and percentiles over the samples.
+
+    Parameters
+    ----------
+    radii_px
+        The radii at which the curves C(R) of the fits are given.
+    """
     held_out: dict[int, list[float]] = {}
     for fit in fits:
         for image, residual in fit.held_out_pct.items():

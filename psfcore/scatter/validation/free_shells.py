@@ -58,10 +58,16 @@ LEAST_LIGHT = 1e-5  # smallest width of the prior, as a fraction of all light
 
 @dataclass(frozen=True, eq=False)
 class FreeLight:
-    """A free fit. light: the fitted light in each shell, as a fraction of all light.
+    """A free fit: light in each shell without a formula.
 
-    law_light: the light that the formula puts in each shell. covariance: covariance matrix of `light`,
-    (shells, shells); it includes the prior.
+    Attributes
+    ----------
+    light
+        The fitted light in each shell, as a fraction of all light.
+    law_light
+        The light that the formula puts in each shell.
+    covariance
+        Covariance matrix of `light`, (shells, shells); it includes the prior.
     """
 
     light: Vector
@@ -73,8 +79,16 @@ class FreeLight:
 class FreeShares:
     """The contributions of each image to the normal equations of Eq. (2), near one PSF.
 
-    normal: J^T w J, (images, shells, shells). score: J^T w r, (images, shells). frames: indices of the images.
-    law_light: the light that the formula of this PSF puts in each shell.
+    Attributes
+    ----------
+    normal
+        The matrices J^T w J, (images, shells, shells).
+    score
+        The right-hand sides J^T w r, (images, shells).
+    frames
+        Indices of the images.
+    law_light
+        The light that the formula of this PSF puts in each shell.
     """
 
     frames: tuple[int, ...]
@@ -83,7 +97,15 @@ class FreeShares:
     score: Matrix
 
     def fit(self, counts: Sequence[int], law_light: Vector) -> FreeLight:
-        """Solve Eq. (2). counts: how many times each image of the transit counts. law_light: centre of the prior."""
+        """Solve Eq. (2).
+
+        Parameters
+        ----------
+        counts
+            The number of times that each image of the transit counts.
+        law_light
+            Centre of the prior.
+        """
         times = np.array([counts[n] for n in self.frames], dtype=np.float64)
         looseness = looseness_of(self.law_light)
         towards = law_light - self.law_light
@@ -107,7 +129,7 @@ def law_light(shape: Shape, coordinates: Vector) -> Vector:
 
 
 def looseness_of(light: Vector) -> Vector:
-    """The width s of the prior for each shell. light: the formula's light in each shell."""
+    """The width s of the prior for each shell, from the light that the formula puts in each shell (`light`)."""
     edges = np.array(shells().edges_px)
     near = edges[1:] <= NEAR_PX
     return np.maximum(np.where(near, NEAR_LOOSE, FAR_LOOSE) * light, LEAST_LIGHT)

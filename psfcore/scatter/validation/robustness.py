@@ -55,9 +55,14 @@ BASE = len(SOFTENED_POWER_LAW.parameters)
 class DarkOffset:
     """The fit with one offset, compared with the fit without an offset.
 
-    weight_change_pct: relative change of the diffuse weight per pixel at radii_px, percent. curve_change_points,
-    total_curve_change_points: change of C(R) of the scatter kernel and of the total PSF at curve_radii_px, in
-    percentage points. images: number of fitted images.
+    Attributes
+    ----------
+    weight_change_pct
+        Relative change of the diffuse weight per pixel at radii_px, percent.
+    curve_change_points, total_curve_change_points
+        Changes of C(R) of the scatter kernel and of the total PSF at curve_radii_px, in percentage points.
+    images
+        Number of fitted images.
     """
 
     offset_dn: float
@@ -71,7 +76,13 @@ class DarkOffset:
 
 @dataclass(frozen=True, eq=False)
 class DarkOffsetStudy:
-    """Effects of dark offsets on the PSF of a transit. nominal: the parameters of the fit without an offset."""
+    """Effects of dark offsets on the PSF of a transit.
+
+    Attributes
+    ----------
+    nominal
+        The parameters of the fit without an offset.
+    """
 
     radii_px: Vector
     curve_radii_px: Vector
@@ -93,8 +104,12 @@ def dark_offset_study(
 ) -> DarkOffsetStudy:
     """Repeat the fit of a transit with each offset, starting from the fit without an offset.
 
-    nominal: the fit without an offset; its shape is used for all fits. Default: a new fit of the softened power law.
     Raises the errors of `invert`.
+
+    Parameters
+    ----------
+    nominal
+        The fit without an offset; its shape is used for all fits. Default: a new fit of the softened power law.
     """
     if nominal is None:
         nominal = invert(transit, threads=threads, progress=progress).inversion
@@ -151,8 +166,14 @@ def with_offset(transit: Transit, offset_dn: float) -> Transit:
 class ComparedShape:
     """The improvement of the fit by one shape, compared with the softened power law, to first order.
 
-    added: value and standard error of each additional parameter. gain: decrease of chi2 for all images. held_out_gain:
-    decrease of chi2 for held-out images; None if there are too few images for folds.
+    Attributes
+    ----------
+    added
+        Value and standard error of each additional parameter.
+    gain
+        Decrease of chi2 for all images.
+    held_out_gain
+        Decrease of chi2 for held-out images; None if there are too few images for folds.
     """
 
     name: str
