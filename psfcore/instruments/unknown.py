@@ -230,7 +230,7 @@ def unknown_instrument(header: Observation, psfs: Sequence[SuitedPsf] = ()) -> D
 def _seen(named: str, telescope: Telescope | None, header: Observation) -> str:
     """The telescope and the channel of an image, for a message. named: the words of its header cards."""
     channel = channel_of(None, header["wavelnth"])
-    cards = f"'{named or 'an unnamed instrument'}'"
+    cards = f"'{named}'" if named else "an unnamed instrument"
     return (f"{telescope.name} ({cards})" if telescope else cards) + (
         f" at {channel} angstrom" if channel else ""
     )
