@@ -23,6 +23,7 @@ from urllib.parse import urljoin, urlsplit
 from psfcore.errors import DataError, did_you_mean, module_of_extra
 from psfcore.files import sha256_of
 from psfcore.fits.blocks import LIMITS
+from psfcore.instruments.files import telescope_of
 from psfcore.instruments.published import PUBLISHED, Published
 
 if TYPE_CHECKING:
@@ -55,9 +56,16 @@ def published(name: str) -> Published:
 
 def published_of(header: Cards) -> Published:
     """The published PSF for an image with this header. Raises DataError "no-published-psf" if none or several fit."""
-    from psfcore.fits.channel import PsfOrigin, channel_differences  # `psf published` reads no header
+    # `psf published` reads no header.
+    from psfcore.fits.channel import PsfOrigin, channel_differences, same_words
+    from psfcore.fits.header import known_instrument
+
+    instrument = known_instrument(header)
+    telescope = "" if instrument is None else telescope_of(instrument)
 
     def fits(one: Published) -> bool:
+        if not same_words(telescope, one.telescope):
+            return False
         scale, wavelength = one.plate_scale_arcsec, one.wavelength_angstrom
         return not channel_differences(
             PsfOrigin(one.name, one.instrument, wavelength, scale, one.cards), header

@@ -118,3 +118,13 @@ class Method:
                     "unknown-parameter", f"expected parameters of {self.name}, {names}; got {name!r}"
                 )
         return {name: one.checked(given.get(name, one.default)) for name, one in known.items()}
+
+
+def check_stop(stop: str | None, *, noise_is_known: bool) -> None:
+    """Raise DataError "no-noise-model" if a stopping rule needs the noise of the camera, which is not known."""
+    if stop == "discrepancy" and not noise_is_known:
+        raise DataError(
+            "no-noise-model",
+            "expected photon gain and read noise of the camera, because the stopping rule discrepancy needs them; got "
+            "neither: give both (--noise, in a request noise), or use the stopping rule fixed",
+        )

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from psfcore.convolution.engine import Engine
 from psfcore.deconvolve.conditions import Conditions, Deconvolved, fluxes
-from psfcore.deconvolve.declaration import Method, Stop
+from psfcore.deconvolve.declaration import Method, Stop, check_stop
 from psfcore.deconvolve.edges import (
     FLAGGED_SHARE,
     Domain,
@@ -173,8 +173,14 @@ class Problem:
         """
         judgement, steps, progress = self.judgement, self.steps, self.conditions.progress
         judged = self.conditions.noise is not None and judgement.pixels > 0
-        if self.stop == "discrepancy" and not judged:
-            raise no_noise_model()
+        if self.stop == "discrepancy":
+            check_stop(self.stop, noise_is_known=self.conditions.noise is not None)
+            if not judgement.pixels:
+                raise DataError(
+                    "no-noise-model",
+                    "expected valid pixels away from the edges, because the stopping rule discrepancy judges them; got "
+                    "none: use the stopping rule fixed",
+                )
         for step in range(1, steps + 1):
             iteration.measure()
             if self.stop == "discrepancy" and judgement.chi2 <= 1:  # Eq. (1)
@@ -273,12 +279,3 @@ def _convolved(
     engine.rows_inverse(lanes)
     for first, block in engine.row_blocks_of(lanes):
         yield slice(first, first + len(block)), block
-
-
-def no_noise_model() -> DataError:
-    """The error if the rule is discrepancy and the noise is not known."""
-    return DataError(
-        "no-noise-model",
-        "expected photon gain, read noise and valid pixels away from the edges, because the stopping rule discrepancy "
-        "needs them; at least one is missing: give the noise figures, or use the stopping rule fixed",
-    )

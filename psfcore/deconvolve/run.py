@@ -20,10 +20,10 @@ from psfcore import software_version
 from psfcore.deconvolve.assess.changes import MEANINGS
 from psfcore.deconvolve.assess.ranks import percentiles
 from psfcore.deconvolve.conditions import Deconvolved, PreparedPsfs, Progress
+from psfcore.deconvolve.declaration import check_stop
 from psfcore.deconvolve.doubts import input_warnings
 from psfcore.deconvolve.kernels import compiling_beside
 from psfcore.deconvolve.memory import EXPECTED_RIM_PX, Demand, check_memory, product_bytes
-from psfcore.deconvolve.problem import no_noise_model
 from psfcore.deconvolve.summary import region_error
 from psfcore.deconvolve.work import Assessed, BoxWork, Options, Work, box_work
 from psfcore.fits.cards import optional_text
@@ -238,8 +238,8 @@ def deconvolve(
         Function that is called with the shape (ny, nx) of box and rim, which is known only after the image is read; it
         may raise.
     """
-    if options.noise is None and options.parameters.get("stop") == "discrepancy":
-        raise no_noise_model()  # measured noise is too uncertain to end an iteration
+    # Measured noise is too uncertain to end an iteration.
+    check_stop(options.parameters.get("stop"), noise_is_known=options.noise is not None)
     noise = None
     if options.error_draws:
         from psfcore.deconvolve.camera_noise import camera_noise  # most deconvolutions do not load SciPy

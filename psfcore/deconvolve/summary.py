@@ -7,6 +7,8 @@ from typing import Any
 
 from psfcore.instruments.psf_statements import offer, title
 
+LOOK_FROM = 1.0  # a person should inspect images with this artefact score or a higher one
+
 
 def summary_lines(details: Mapping[str, Any]) -> list[str]:
     """The lines that summarise a product, from its `psfcore.deconvolve.run.Product.details`."""
@@ -17,6 +19,11 @@ def summary_lines(details: Mapping[str, Any]) -> list[str]:
         f"{steps_done(details)}: flux {percent(details['flux_change_pct'], 3)}, brightest 1 % of pixels "
         f"{percent(details['bright_change_pct'])}, darkest 1 % {percent(details['dark_change_pct'])}",
     ]
+    if (doubt := artefact_doubt(details)) is not None:
+        lines.append(
+            f"artefacts: {doubt}; compare the pixels with a bit in QUALITY before and after; if they are artefacts, "
+            "use fewer steps or another PSF"
+        )
     if region is not None:
         lines.append(
             f"region {region['box']}, rim {region['rim_px']} px: {region_error(region.get('error_pct'))}"
@@ -26,6 +33,17 @@ def summary_lines(details: Mapping[str, Any]) -> list[str]:
     if psf.get("published"):  # products of earlier versions have no such entry
         lines.append(f"better: {offer(psf['published'])}")
     return lines
+
+
+def artefact_doubt(details: Mapping[str, Any]) -> str | None:
+    """That a deconvolution may have made artefacts; None: its artefact score is below `LOOK_FROM`."""
+    score = details["changes"]["artefacts"]["score"]
+    if score < LOOK_FROM:
+        return None
+    return (
+        f"the artefact score is {score:.3g}, which is {LOOK_FROM:g} or more: the deconvolution may have made "
+        "artefacts"
+    )
 
 
 def region_error(error_pct: float | None) -> str:

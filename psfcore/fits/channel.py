@@ -114,7 +114,7 @@ def channel_differences(psf: Origin, header: Cards) -> list[str]:
         )
     for key, of_psf in psf.cards.items():
         of_image = optional_text(header, key)
-        if of_image is not None and not _same_words(of_image, of_psf):
+        if of_image is not None and not same_words(of_image, of_psf):
             differences.append(f"the image has {key} {of_image!r}, the PSF {of_psf!r}")
     return differences
 
@@ -130,7 +130,7 @@ def _other_instrument(psf: Origin, header: Cards) -> str | None:
     # instrument.
     matches = {key: text for key, text in match_table(psf.instrument).items() if isinstance(text, str)}
     cards = {key: optional_text(header, key) for key in ("TELESCOP", "OBSRVTRY", "INSTRUME", "DETECTOR")}
-    compared = [_same_words(text, matches[key]) for key, text in cards.items() if text and key in matches]
+    compared = [same_words(text, matches[key]) for key, text in cards.items() if text and key in matches]
     same = not matches or (compared and all(compared))
     return None if same else " ".join(text for text in cards.values() if text) or None
 
@@ -151,7 +151,8 @@ def _wavelengths(psf: Origin, header: Cards) -> dict[str, float | None]:
     }
 
 
-def _same_words(one: str, other: str) -> bool:
+def same_words(one: str, other: str) -> bool:
+    """Whether one of two texts has all words of the other."""
     first, second = (set(re.findall(r"[a-z0-9.]+", text.lower())) for text in (one, other))
     return first <= second or second <= first
 

@@ -25,6 +25,7 @@ DRAFT = "draft"
 # not contain it, because their text is part of the ids of PSFs.
 _DIFFUSE_LIGHT = {"SDO/AIA": "10 to 35 % of all light, Hofmeister et al. 2024"}
 _BASES = ("mount_basis", "mesh_basis", "scatter_basis")
+_ENTRY = re.compile(rf"^({'|'.join((*_BASES, 'component'))}): (\w+)$", re.MULTILINE)
 _STATUS = re.compile(r'^status = "draft" +# (.+)$', re.MULTILINE)
 
 
@@ -63,6 +64,7 @@ def bases_of(instrument: Instrument) -> dict[str, str]:
 
 def assumptions(name: str, instrument: str | None, provenance: Mapping[str, object]) -> list[str]:
     """What of a PSF is assumed or inferred. A draft of a shipped instrument file says so beside its status."""
+    provenance = _stated(provenance)
     if _is_shipped(name, instrument, provenance):
         status = _STATUS.search(instrument_path(name).read_text("utf-8"))
         return [] if status is None else [status[1].replace(" below", "")]
@@ -74,13 +76,14 @@ def assumptions(name: str, instrument: str | None, provenance: Mapping[str, obje
 
 def mesh_is_assumed(name: str, instrument: str | None, provenance: Mapping[str, object]) -> bool:
     """Whether a PSF was built from an instrument file that assumes a part of its meshes."""
-    return _bases(name, instrument, provenance).get("mesh_basis") == "assumed"
+    return _bases(name, instrument, _stated(provenance)).get("mesh_basis") == "assumed"
 
 
 def scatter_left(name: str, instrument: str | None, provenance: Mapping[str, object]) -> str | None:
     """What a deconvolution with a PSF without diffuse scatter leaves in the image; None: the PSF contains scatter, or
     it was not built from an instrument file.
     """
+    provenance = _stated(provenance)
     bases = _bases(name, instrument, provenance)
     whole = provenance.get("component") in (None, "SCATTER")
     if "mount_basis" not in bases or ("scatter_basis" in bases and whole):
@@ -105,9 +108,12 @@ def offer(published: Sequence[str]) -> str:
 
 
 def caveats(name: str, instrument: str | None, provenance: Mapping[str, object]) -> list[str]:
-    """What makes a result of a PSF uncertain: what is assumed in the PSF, and the scattered light that it leaves."""
-    left = scatter_left(name, instrument, provenance)
-    return [*assumptions(name, instrument, provenance), *([] if left is None else [left])]
+    """What makes a result of a PSF uncertain: that it is only a component, what is assumed in it, and the scattered
+    light that it leaves.
+    """
+    component, left = _stated(provenance).get("component"), scatter_left(name, instrument, provenance)
+    only = [] if component is None else [f"only the component {component}, not the whole PSF"]
+    return [*only, *assumptions(name, instrument, provenance), *([] if left is None else [left])]
 
 
 def remarks(name: str, instrument: str | None, provenance: Mapping[str, object], status: str) -> list[str]:
@@ -137,6 +143,15 @@ def curves_once(
         once.pop(names, None)
         once[(*names, name)] = curve
     return once
+
+
+def _stated(provenance: Mapping[str, object]) -> Mapping[str, object]:
+    """The provenance with what its history says. The provenance of a PSF that was read from a file has the lines of
+    HISTORY in place of most entries.
+    """
+    history = provenance.get("history")
+    lines = history if isinstance(history, list) else []
+    return dict(_ENTRY.findall("\n".join(map(str, lines)))) | dict(provenance)
 
 
 def _bases(name: str, instrument: str | None, provenance: Mapping[str, object]) -> Mapping[str, object]:

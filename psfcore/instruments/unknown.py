@@ -243,7 +243,7 @@ def _seen(named: str, telescope: Telescope | None, header: Observation) -> str:
         The words of the header cards of the image.
     """
     channel = channel_of(None, header["wavelnth"])
-    cards = f"'{named or 'an unnamed instrument'}'"
+    cards = f"'{named}'" if named else "an unnamed instrument"
     return (f"{telescope.name} ({cards})" if telescope else cards) + (
         f" at {channel} angstrom" if channel else ""
     )

@@ -14,6 +14,7 @@ from fastapi import APIRouter, Path, Query, Response
 from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 
+from psfcore.deconvolve.summary import LOOK_FROM
 from service.http.callers import Bulk, Caller, KeyFirst, Reading
 from service.http.paging import Page, Paging, place, position
 from service.http.problems import RESPONSES, Problem, as_problems, problem
@@ -33,7 +34,6 @@ router = APIRouter(prefix="/v1/bulk", tags=["bulk"], responses=RESPONSES, route_
 BulkId = Annotated[str, Path(pattern=r"^[0-9a-f]{32}$")]
 SAMPLE, MOST_SAMPLED = 200, 10_000  # images that an estimate examines
 NDJSON, CSV = "application/x-ndjson", "text/csv"
-LOOK_FROM = 1.0  # a person should inspect images with this artefact score or a higher one
 
 
 class Counts(BaseModel):

@@ -115,7 +115,12 @@ def submit(
         raise click.UsageError(
             "--dry-run uploads and starts nothing: use it with PATTERNS or --image, without --upload and --wait"
         )
-    uploaded, refused = _upload(service, fits_files(uploads))
+    files = fits_files(uploads)
+    if not (files or images or patterns):
+        raise click.UsageError(
+            "expected images: FITS files or folders of them (--upload), ids (--image) or PATTERNS; got none"
+        )
+    uploaded, refused = _upload(service, files)
     if refused and not (uploaded or images or patterns):
         raise click.ClickException(
             "no file could be uploaded, so no bulk run was started; the reasons are listed above"

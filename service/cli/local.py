@@ -21,7 +21,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 from psfcore import limited
 from psfcore.compiled import listening
 from psfcore.deconvolve.box import Box
-from psfcore.deconvolve.declaration import KnownScene
+from psfcore.deconvolve.declaration import KnownScene, check_stop
 from psfcore.deconvolve.forward import Convolved, convolve_image
 from psfcore.deconvolve.run import UsedPsf
 from psfcore.errors import DataError
@@ -288,6 +288,7 @@ class Local(Operations):
         summary = self._workspace(request.image_id).summary(request)
         if not request.again:
             check_not_deconvolved(summary.content)
+        check_stop(request.method.stop, noise_is_known=request.noise is not None)
         if request.region is not None:
             Box.parse(request.region).checked(summary.shape)
         if request.context not in (None, _NOW):

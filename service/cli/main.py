@@ -5,6 +5,7 @@ imported when it is called, so that ``heliopsf --version`` is fast.
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -24,6 +25,11 @@ INTERRUPTED = 130  # exit status of a command that was ended by Control-C: 128 +
 PIPE_CLOSED = 141  # that of a command whose reader ended first: 128 + the number of SIGPIPE
 REJOIN = {"job": "heliopsf job wait {id}", "bulk": "heliopsf bulk status {id} --wait"}
 NO_KEY = "this service needs a key: set HELIOPSF_KEY to your key (the operator makes keys with `heliopsf key create`)"
+# Where the fault of a request is, such as "body/deconvolve/parameters/size: "; a check of several fields may name one.
+_PLACE = re.compile(
+    r"(?:^|(?<=; ))(?:(?:body/[a-z-]+/)?parameters|body)(?:/(?P<field>[a-z_]+)(?:/[\w-]+)*)?: "
+    r"(?:Value error, (?:(?P<own>[a-z]+_[a-z_]+): )?)?"
+)
 _FETCH = "                      it prints the command that writes the result, such as heliopsf product get ID -o FILE\n"
 
 
@@ -126,7 +132,8 @@ def user_errors() -> Iterator[None]:
         raise click.ClickException("\n".join(error_lines(error.message, error.fields, local=True))) from error
     except ServiceError as error:
         message = NO_KEY if error.code == "no-key" else str(error)
-        raise click.ClickException("\n".join(error_lines(message, error.fields, local=False))) from error
+        lines = error_lines(named_by_options(message), error.fields, local=False)
+        raise click.ClickException("\n".join(lines)) from error
     except ImportError as error:
         missing = missing_extra(error) if isinstance(error, ModuleNotFoundError) else error
         if not isinstance(missing, MissingExtra):
@@ -135,6 +142,17 @@ def user_errors() -> Iterator[None]:
         raise click.ClickException(f"{missing}{local}") from error
     except OSError as error:
         raise click.ClickException(str(error)) from error
+
+
+def named_by_options(message: str) -> str:
+    """The message of a refused request with the options of a command in place of the fields of the request."""
+    from service.cli.options import option_name
+
+    def option(found: re.Match[str]) -> str:
+        field = found["field"] or found["own"]
+        return "" if field is None else f"{option_name(field)}: "
+
+    return _PLACE.sub(option, message)
 
 
 def _interrupted(stop: KeyboardInterrupt) -> str:

@@ -112,6 +112,11 @@ def _name(model: type[BaseModel], name: str) -> str:
     return _about(_field(model, name)).name or f"--{name.replace('_', '-')}"
 
 
+def option_name(field: str) -> str:
+    """The name of the option of this field of a request for a deconvolution, or of another request."""
+    return _name(Deconvolve, field) if field in Deconvolve.model_fields else f"--{field.replace('_', '-')}"
+
+
 def _kind(field: FieldInfo) -> object:
     """The type of a value that is given."""
     kind = field.annotation

@@ -11,8 +11,8 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import JSONResponse, RedirectResponse
 
+from psfcore.deconvolve.summary import LOOK_FROM
 from service.api.bulk import (
-    LOOK_FROM,
     BulkId,
     Failed,
     Result,

@@ -18,11 +18,10 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import JSONResponse, RedirectResponse
 from starlette.background import BackgroundTasks
 
-from psfcore.deconvolve.summary import region_error, steps_done
+from psfcore.deconvolve.summary import artefact_doubt, region_error, steps_done
 from psfcore.fits.header import read_summary
 from psfcore.instruments.files import telescope_of, telescopes
 from psfcore.instruments.psf_statements import remarks, title
-from service.api.bulk import LOOK_FROM
 from service.api.images import delete_product, get_product_lineage, rerun_product, upload_image
 from service.api.jobs import EstimateView, estimate_job, submit_job
 from service.api.pixels import picture_of, prepare_image
@@ -269,7 +268,7 @@ def product(product_id: Identity, request: Request, caller: PageReading, state: 
         published=published,
         redo_published=_again(row, psf_id=held[0].id) if held else None,
         redo=_again(row, psf_id="" if better is None else better.id),
-        look_from=LOOK_FROM,
+        artefact_doubt=artefact_doubt(row.details),
         again=_again(row),
         steps=steps_done(row.details),
         lineage=get_product_lineage(product_id, caller, state),
@@ -301,6 +300,7 @@ def report(product_id: Identity, request: Request, caller: PageReading, state: S
         deprecated=None if psf is None else deprecation(state.catalogue, psf),
         sources=[source for parent in parents if parent.type == "psf" for source in _ancestors(parent)],
         steps=steps_done(row.details),
+        artefact_doubt=artefact_doubt(row.details),
         region_error=region_error,
     )
 

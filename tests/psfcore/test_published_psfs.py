@@ -14,9 +14,10 @@ import pytest
 from astropy.io import fits
 
 from psfcore.errors import DataError
+from psfcore.fits.cards import Cards
 from psfcore.fits.psfs import read_psf
 from psfcore.instruments.published import PUBLISHED
-from psfcore.published_psfs import LIMITS, get, kept_file
+from psfcore.published_psfs import LIMITS, get, kept_file, published_of
 from tests.published_server import CHECKSUM, NAME, SIZE_PX, answer, published_fits, stand_in
 
 
@@ -30,6 +31,22 @@ def test_the_list_names_each_file_once_and_how_to_cite_it() -> None:
         assert {"https://" + urlsplit(address).netloc for address in asked} <= set(one.origins)
         assert all(origin.startswith("https://") for origin in one.origins)
         assert bool(one.addresses) == bool(one.sha256 or one.checksum_address), "a download has a checksum"
+
+
+@pytest.mark.parametrize(
+    ("cards", "name"),
+    [
+        ({"TELESCOP": "SDO/AIA", "INSTRUME": "AIA_3", "WAVELNTH": 171}, "aia_171_2025"),
+        ({"TELESCOP": "SDO/AIA", "WAVELNTH": 304}, "aia_304_2025"),
+        ({"OBSRVTRY": "STEREO_A", "DETECTOR": "EUVI", "WAVELNTH": 304}, "euvi_304_a_2012"),
+        (
+            {"TELESCOP": "STEREO", "INSTRUME": "SECCHI", "OBSRVTRY": "STEREO_B", "WAVELNTH": 171},
+            "euvi_171_b_2012",
+        ),
+    ],
+)
+def test_an_image_has_the_published_psf_of_its_telescope(cards: Cards, name: str) -> None:
+    assert published_of(cards).name == name
 
 
 def test_a_download_is_kept_as_a_psf_that_says_what_it_is(tmp_path: Path) -> None:

@@ -303,11 +303,11 @@ class Report(Parameters):
     seed: int = Field(1, ge=0, lt=2**31, description="seed of all random numbers")
     dark_offsets: bool = Field(
         True,
-        description="also fit with -5, -3, +3 and +5 DN added to every image; ignored if psf_id is given",
+        description="also fit with -5, -3, +3 and +5 DN added to every image; ignored if a PSF is given",
     )
     shapes: bool = Field(
         False,
-        description="also compare the scatter shapes by their residuals on held-out images; only without psf_id",
+        description="also compare the scatter shapes by their residuals on held-out images; only if no PSF is given",
     )
 
     @model_validator(mode="after")

@@ -15,7 +15,6 @@ from pydantic import BaseModel, Field
 
 from psfcore.errors import DataError
 from psfcore.fits.header import HeaderJson
-from psfcore.instruments.model import load_instrument
 from psfcore.instruments.psf_statements import version_text
 from psfcore.instruments.unknown import SuitedPsf, agreement, unknown_instrument
 from psfcore.instruments.unknown import channel_of as channel_of_image
@@ -23,6 +22,7 @@ from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.contexts import NOW, Ends
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import ImageRow, PsfContextRow, PsfRow
+from workers.contract.identities import instrument_of_build
 from workers.contract.requests import Deconvolve, PsfInterpolate, ResolvedDeconvolve
 from workers.versions import (
     TOTAL,
@@ -275,8 +275,8 @@ def reasoned_psf(
         why = _why_interpolated(resolved.psf_interpolation, catalogue, owner) + "; the job makes it first."
     else:
         # resolve() has found the image and the PSF, or the recipe of the PSF
-        assert resolved.psf_recipe is not None and resolved.psf_recipe.instrument is not None
-        instrument = load_instrument(resolved.psf_recipe.instrument)
+        assert resolved.psf_recipe is not None
+        instrument = instrument_of_build(resolved.psf_recipe)
         name = instrument.name
         version = version_text(instrument.version, instrument.status, resolved.psf_id)
         why = _why_built(wanted, catalogue, owner) + "; the job builds it first."

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from psfcore.deconvolve.box import Box
+from psfcore.deconvolve.declaration import check_stop
 from psfcore.fits.frame import frame_of
 from psfcore.fits.header import HeaderJson, check_not_deconvolved
 from psfcore.gap.effect_sources import sha256_of_source
@@ -156,6 +157,7 @@ def resolved_deconvolution(
     """
     if not wanted.again:
         check_not_deconvolved(header["content"])
+    check_stop(wanted.method.stop, noise_is_known=wanted.noise is not None)
     if wanted.region is not None:
         Box.parse(wanted.region).checked((header["shape"][0], header["shape"][1]))
     resolved = ResolvedDeconvolve(

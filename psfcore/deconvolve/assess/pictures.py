@@ -22,6 +22,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from psfcore.deconvolve.assess.changes import Changes, QualityBit, block_means
+from psfcore.deconvolve.summary import LOOK_FROM
 from psfcore.drawing.plots import (
     CHANGE,
     CHANGE_LIMIT_PCT,
@@ -52,7 +53,6 @@ MOST_ON_SHEET = 60
 DATE_KEYS = ("DATE-BEG", "DATE-OBS", "T_OBS")
 # Each image is represented by these rows of psfcore.deconvolve.assess.changes: blocks of 4 px, tails of 1 %.
 BLOCK_PX, TAIL_PCT = 4, 1.0
-LOOK_FROM = 1.0
 _MARKS = 300
 _LETTERS = 48
 _DOUBTFUL, _CLEAN = "#b3261e", "#2b8a6e"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -66,8 +67,15 @@ def build(
             overwrite=overwrite,
         )
     echo(f"{output}: {title(built['name'], built['version'], built['status'])}, id {short(built['id'])}")
-    for radius, beyond_pct in built["details"]["cumulative_curve_pct"].items():
-        echo(f"  light beyond {radius:>5} px  {beyond_pct:6.2f} %")
+    details = built["details"]
+    for caveat in caveats(built["name"], built["instrument"], details["provenance"]):
+        echo(f"  {caveat}")
+    reach_px = (
+        math.hypot(*details["shape"]) / 2
+    )  # farther out, no weight of the array says where the light is
+    for radius, beyond_pct in details["cumulative_curve_pct"].items():
+        if float(radius) < reach_px:
+            echo(f"  light beyond {radius:>5} px  {beyond_pct:6.2f} %")
 
 
 TOLD_PX = (10, 100)  # the JSON and `psf show` have the curve at more radii
@@ -166,9 +174,10 @@ def show(file: Path, plot: Path | None, overwrite: bool) -> None:
     kernels = {"TOTAL": psf.kernel, **psf.components}
     curves = {name: cumulative_curve(kernel, radii) for name, kernel in kernels.items()}
     echo(f"{title(psf.name, psf.version, psf.status)}, instrument {psf.instrument or 'unnamed'}")
+    scale = "unknown" if psf.plate_scale_arcsec is None else f"{psf.plate_scale_arcsec} arcsec/px"
     echo(
         f"{psf.kernel.shape[1]} x {psf.kernel.shape[0]} px, reach {psf.reach_px:.0f} px, sum {psf.kernel.sum():.6f}, "
-        f"central pixel {psf.kernel.max():.4f}, plate scale {psf.plate_scale_arcsec or 'unknown'} arcsec/px"
+        f"central pixel {psf.kernel.max():.4f}, plate scale {scale}"
     )
     for caveat in caveats(psf.name, psf.instrument, psf.provenance):
         echo(caveat)

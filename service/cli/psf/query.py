@@ -59,7 +59,7 @@ def list_published() -> None:
         there = "*" if (published_folder() / f"{one.name}.fits").is_file() else " "
         size = f"{one.size_px} px" + (f", {one.file_mib} MiB" if one.file_mib else "")
         echo(
-            f"{there} {one.name:<16} {one.telescope:<13} {one.channel:<6}  {size:<16} {one.contains}\n"
+            f"{there} {one.name:<16} {one.telescope:<13} {one.channel:<6}  {size:<16}  {one.contains}\n"
             f"    {one.citation}; DOI {one.doi or 'unknown'}"
             + ("" if one.addresses else f"; no public address, get {one.file} from {one.place}")
         )

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+from psfcore.build import build_psf
+from psfcore.fits.blocks import LIMITS
+from psfcore.fits.psfs import read_psf, write_psf
 from psfcore.instruments.files import instrument_names, telescope_of
-from psfcore.instruments.model import load_instrument
+from psfcore.instruments.model import load_instrument, parse_instrument
 from psfcore.instruments.psf_statements import (
     assumptions,
     caveats,
@@ -19,6 +24,7 @@ from psfcore.instruments.psf_statements import (
 )
 from psfcore.instruments.published import PUBLISHED, published_for
 from psfcore.instruments.unknown import TELESCOPES
+from tests.conftest import SMALL_INSTRUMENT
 
 
 def test_every_shipped_draft_says_what_it_assumes_and_what_scatter_it_leaves() -> None:
@@ -49,6 +55,18 @@ def test_other_psfs_say_what_their_provenance_does() -> None:
     assert assumptions("hri_euv", "hri_euv", changed) == ["mesh of the filter assumed"]
     assert mesh_is_assumed("hri_euv", "hri_euv", changed)
     assert len(remarks("mine", None, {}, "draft")) == 1 and remarks("mine", None, {}, "certified") == []
+
+
+def test_a_psf_that_was_read_from_a_file_says_what_it_said_when_it_was_built(tmp_path: Path) -> None:
+    instrument = parse_instrument(SMALL_INSTRUMENT, "small")
+    for component in (None, "AIRY"):
+        built = build_psf(instrument, size=64, component=component)
+        file = tmp_path / f"{component}.fits"
+        write_psf(file, built)
+        read = read_psf(file, LIMITS)
+        said = [caveats(psf.name, psf.instrument, psf.provenance) for psf in (built, read)]
+        assert said[0] == said[1] and len(said[0]) == (1 if component is None else 2), component
+        assert component is None or component in said[0][0]
 
 
 def test_a_published_psf_with_the_scatter_that_stays_is_offered() -> None:

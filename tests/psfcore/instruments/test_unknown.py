@@ -73,6 +73,11 @@ def test_the_error_names_the_telescope_the_reason_and_the_step() -> None:
         assert (error.fields["reason"] is None) is bool(cards) and error.fields["ways"] == list(WAYS)
 
 
+def test_an_image_that_names_nothing_is_not_quoted() -> None:
+    error = refusal(Header({}))
+    assert "an image of an unnamed instrument" in error.message and "''" not in error.message
+
+
 def test_the_error_names_the_cards_that_the_header_lacks(tmp_path: Path) -> None:
     aia = {"TELESCOP": "SDO/AIA", "INSTRUME": "AIA_3"}
     for cards, named in (

@@ -91,6 +91,7 @@ def test_a_region_that_cannot_be_is_refused(api: TestClient, image_file: Path, p
         ({"region": "0:40,0:8"}, "region-too-small", "16 px"),
         (box | {"error_draws": 4}, "invalid-request", "error_draws 0 with a region"),
         (box | {"method": discrepancy}, "invalid-request", "stopping rule fixed"),
+        ({"method": discrepancy}, "no-noise-model", "photon gain"),
         (box | {"region_error": 0}, "invalid-request", "region_error"),
     ]
     for parameters, code, said in cases:

@@ -121,6 +121,8 @@ def test_an_image_of_a_known_instrument_needs_no_psf_id(api: TestClient, tmp_pat
     job = api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": parameters})
     recipe = job.json()["parameters"]["psf_recipe"]
     assert recipe["instrument"] is None and recipe["instrument_file"].startswith("turn_deg = 20.00\n")
+    estimate = api.post("/v1/estimates", json={"kind": "deconvolve", "parameters": parameters})
+    assert estimate.json()["psf"]["name"] == "hri_euv" and estimate.json()["psf"]["status"] is None
 
 
 def test_a_database_that_is_away_is_503(api: TestClient, settings: Settings) -> None:

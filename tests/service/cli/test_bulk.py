@@ -111,3 +111,12 @@ def test_a_folder_of_bad_files_starts_nothing(
     told = command("bulk", "submit", "--upload", folder, "--psf", psf, code=1)
     assert "no file could be uploaded, so no bulk run was started" in told
     assert api.get("/v1/bulk").json()["items"] == api.get("/v1/images").json()["items"] == []
+
+
+def test_a_run_without_images_is_refused_before_the_psf_is_sent(
+    command: Command, client: Client, tmp_path: Path, psf_file: Path
+) -> None:
+    (tmp_path / "empty").mkdir()
+    for given in ((), ("--upload", tmp_path / "empty")):
+        assert "--upload" in command("bulk", "submit", *given, "--psf", psf_file, code=2)
+    assert client.get("/v1/psfs")["items"] == []

@@ -126,7 +126,7 @@ def test_an_error_is_told_once_with_local(folder: Path) -> None:
         [sys.executable, "-m", "service.cli", *map(str, line)], capture_output=True, text=True
     )
     assert done.returncode == 1
-    assert done.stderr.count("expected photon gain, read noise") == 1, done.stderr
+    assert done.stderr.count("expected photon gain and read noise") == 1, done.stderr
     assert "job " not in done.stderr
 
 

@@ -42,6 +42,10 @@ def test_files_are_read_in_place_and_only_as_they_were(tmp_path: Path) -> None:
             service.upload_psf(tmp_path / "psf.fits"),
         )
         assert image["id"] == sha256_of(tmp_path / "image.fits")
+        with pytest.raises(DataError, match=r"no-noise-model.*--noise"):
+            service.submit(
+                "deconvolve", image_id=image["id"], method={"name": "linear", "stop": "discrepancy"}
+            )
         job = service.submit("deconvolve", image_id=image["id"], psf_id=psf["id"])
         os.utime(tmp_path / "image.fits", ns=(1, 1))
         with pytest.raises(OSError, match=r"image\.fits changed while it was read"):

@@ -16,7 +16,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from service.cli.main import Lazy, LazyGroup, main, user_errors
+from service.cli.main import Lazy, LazyGroup, main, named_by_options, user_errors
 from service.client.errors import WaitInterrupted
 from tests.conftest import write_image
 
@@ -171,3 +171,17 @@ def test_a_reader_that_ends_first_ends_the_command_quietly() -> None:
     assert (done.returncode, done.stderr) == (141, "")
     with pytest.raises(click.ClickException), user_errors():
         raise BrokenPipeError
+
+
+@pytest.mark.parametrize(
+    ("of_request", "option"),
+    [
+        ("parameters/size: even", "--size: even"),
+        ("parameters/noise/photon_gain_dn: a; body/deconvolve/parameters/steps: b", "--noise: a; --steps: b"),
+        ("parameters: Value error, error_draws: expected 0", "--errors: expected 0"),
+        ("body: Value error, expected images", "expected images"),
+        ("expected an id; got parameters/size: 3", "expected an id; got parameters/size: 3"),
+    ],
+)
+def test_an_error_names_the_option_and_not_the_place_in_a_request(of_request: str, option: str) -> None:
+    assert named_by_options(of_request) == option

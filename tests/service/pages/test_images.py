@@ -170,7 +170,9 @@ def test_a_high_artefact_score_comes_with_advice(
         details = product["details"] | {"changes": {"artefacts": {"score": score}}}
         execute(catalogue, update(ProductRow).values(details=details))
         page = api.get(f"/products/{product['id']}").text
-        assert ("The artefact score is 1 or more" in page) == advised, score
+        sheet = api.get(f"/products/{product['id']}/print").text
+        for text in (page, sheet):
+            assert ("The artefact score is 1, which is 1 or more" in text) == advised, score
         assert page.count(f'href="{again}"') == 1 + advised, score
     assert "<dd>linear, 2 steps</dd>" in page
 

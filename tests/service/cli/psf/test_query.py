@@ -14,10 +14,11 @@ from fastapi.testclient import TestClient
 
 import heliopsf
 from psfcore.errors import DataError
+from psfcore.instruments.psf_statements import caveats
 from psfcore.instruments.published import PUBLISHED
 from service.cli.main import main
 from service.client.http import Client
-from tests.conftest import SMALL_INSTRUMENT, write_image
+from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
 from tests.published_server import NAME, published_fits, stand_in
 from workers.settings import Settings
 
@@ -131,7 +132,7 @@ def run(*words: str) -> str:
 def test_the_cache_is_listed_and_cleared(tmp_path: Path) -> None:
     assert run("cache", "list").startswith("0 PSFs, 0.0 of 2048 MiB")
     (tmp_path / "small.toml").write_text(SMALL_INSTRUMENT)
-    run(
+    built = run(
         "psf",
         "build",
         "--instrument",
@@ -142,11 +143,25 @@ def test_the_cache_is_listed_and_cleared(tmp_path: Path) -> None:
         str(tmp_path / "a.fits"),
         "--local",
     )
+    assert " 20 px" in built and " 50 px" not in built, "the PSF reaches 45 px"
     listed = run("cache", "list").splitlines()
     assert len(listed) == 2 and listed[0].endswith("your instrument file, 64 px")
     assert listed[1].startswith("1 PSFs")
     assert run("cache", "clear").startswith("removed 1 PSFs")
     assert run("cache", "list").startswith("0 PSFs")
+
+
+def test_a_built_psf_is_described_as_its_file_is(tmp_path: Path) -> None:
+    (tmp_path / "small.toml").write_text(SMALL_INSTRUMENT)
+    file = str(tmp_path / "a.fits")
+    built = run(
+        "psf", "build", "--instrument", str(tmp_path / "small.toml"), "--size", "64", "-o", file, "--local"
+    )
+    psf = heliopsf.read_psf(file)
+    said = caveats(psf.name, psf.instrument, psf.provenance)
+    assert said and all(one in built and one in run("psf", "show", file) for one in said)
+    write_psf(tmp_path / "b.fits")
+    assert "plate scale unknown\n" in run("psf", "show", str(tmp_path / "b.fits"))
 
 
 def test_a_wrong_size_is_told_in_one_line() -> None:
