@@ -1,8 +1,8 @@
 """The judge of a diagnosed case of a blind set: its true causes, its report, and whether the report is right.
 
 **Entries.** A report states one entry for each cause that it claims (`causes`), and none if it finds no gap. The
-alternatives of an entry are the causes of which one acts with 90 %. An alternative names a stage, a family, and an
-effect of the gap library, or no effect: another form of the family.
+alternatives of an entry are the causes of which one acts with 90 %. An alternative names a stage and a family, and also
+an effect of the gap library; without an effect, it means another form of the family.
 
 **Levels.** An alternative is right at the level of
 

@@ -136,7 +136,8 @@ def _times(a: Leg, w: Leg, first: int = 0) -> Leg:
     Parameters
     ----------
     first
-        The product in the imaginary part that is rounded together with the sum: 0 for ar * wi, 1 for ai * wr.
+        The product of the imaginary part, ar * wi + ai * wr, for the fused multiply-add, which rounds product and sum
+        once: 0 for ar * wi, 1 for ai * wr.
     """
     (ar, ai), (wr, wi) = a, w
     real = ar.times_plus(wr, -(ai * wi))

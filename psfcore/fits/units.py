@@ -1,9 +1,9 @@
 """The unit of an image's pixels: counts of an exposure, a rate of counts, or another quantity.
 
-Counts are DN, ADU or counts; all three mean numbers of the A/D converter. A rate is counts per time. Both may be
-written per pixel, in every way that `astropy.units` reads, and in the ways of observatories that it does not read
-("dn/sec", "counts / pixel"). Saturation levels and noise figures are in DN of one exposure, so `dn_per_unit` converts
-them. `unit_label` and `rate_label` are the units that pictures show.
+Counts are DN, ADU or counts; all three mean numbers of the A/D converter. A rate is counts per time. Both may be per
+pixel. All spellings that `astropy.units` reads are accepted, and also spellings that observatories use and
+`astropy.units` does not read, such as "dn/sec" and "counts / pixel". Saturation levels and noise figures are in DN of
+one exposure, so `dn_per_unit` converts them. `unit_label` and `rate_label` are the units that pictures show.
 """
 
 from __future__ import annotations

@@ -383,7 +383,9 @@ def _columns_of_stamps(orders: Orders, bases: _Bases, stamps: Vector) -> Plane:
 
 
 def _columns_of_source(orders: Orders, bases: _Bases, geometry: Geometry, amplitude: Vector) -> Plane:
-    """Columns of the Jacobian for S [pixel, coefficient of S on the disc]."""
+    """Derivatives of the model by the spline coefficients of the source picture S [fitted pixel, knot of the
+    disc].
+    """
     row, column = np.nonzero(geometry.disc)
     columns = np.zeros((orders.value.size, row.size))
     for which, a in enumerate(amplitude):

@@ -12,8 +12,9 @@ All requests are answered in rounds of one event loop, and each needs several ro
 key begin one after the other, and of the bodies of one owner one piece arrives in a round: it stays short if one owner
 sends very much at once.
 
-Every text of a request is checked by ``check_text``: those of the address and of JSON here, those of forms where the
-forms are read. The interfaces of the Virtual Observatory check theirs themselves, and answer errors in another form.
+``check_text`` checks every string of a request: this module calls it for the address and for JSON, and the code that
+reads a form calls it for the form. The interfaces of the Virtual Observatory check theirs themselves, and answer errors
+in another form.
 """
 
 from __future__ import annotations

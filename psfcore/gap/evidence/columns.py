@@ -1,7 +1,8 @@
 """The columns of the free fields: what a change of unknown form does to the discs and to the unocculted blocks.
 
-A field is an operator times a modulation (`tree` lists them). The operator is one step of the light; the modulation
-says how the change depends on place, time, pointing, or kind of image. A column is one coefficient of the field.
+A field is an operator times a modulation (`tree` lists them). The operator says what changes, for example added light,
+the gain or the PSF; the modulation says how the change depends on place, time, pointing, or kind of image. A column is
+one coefficient of the field.
 
 | operator | change of image n at the place x, with the bumps b(x) |
 |---|---|

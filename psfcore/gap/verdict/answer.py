@@ -111,7 +111,7 @@ class Alternative:
 
 @dataclass(frozen=True, eq=False)
 class Cause:
-    """One cause: it is one of the alternatives, the most probable first."""
+    """One cause, as a list of alternatives of which one is true, the most probable first."""
 
     alternatives: tuple[Alternative, ...]
 
