@@ -221,8 +221,8 @@ def named_psf(service: Operations, psf: str | None, *, image: Path | None = None
     if is_psf_id(psf) and service.server is None:
         raise DataError(
             "no-such-psf",
-            f"expected a file or the name of a PSF, because this command asks no service; got the id {psf}: download "
-            f"the PSF first (`heliopsf psf download {psf} -o FILE`)",
+            f"expected a file or the name of a PSF, because this command asks no service; got the id {short(psf)}: "
+            f"download the PSF first (`heliopsf psf download {short(psf)} -o FILE`)",
         )
     if is_psf_id(psf):
         return whole_id(service, "psfs", psf)
