@@ -258,12 +258,13 @@ class Convolution(_BeforeAndAfter, Convolved):
         return {}
 
     def lines(self) -> list[str]:
-        """Describe the result in two lines.
+        """Describe the result in lines.
 
         Returns
         -------
         list of str
-            PSF and edges; then shape, brightest pixel, and the share of the light that stays in the field.
+            PSF and edges; then the caveats of the PSF, if it has some; then shape, brightest pixel, and the share of
+            the light that stays in the field.
         """
         return forward.lines(self, used_psf(self.psf))
 

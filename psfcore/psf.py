@@ -141,7 +141,9 @@ def _check_weights(kernel: Kernel) -> None:
     if not SMALLEST_SUM < total <= LARGEST_SUM:
         expected = f"weights that sum to 1 over the full reach, or to less if cropped ({SMALLEST_SUM} to {LARGEST_SUM})"
         raise DataError(
-            "psf-sum", f"expected {expected}; got {total:.6g}. Divide the weights by their sum first"
+            "psf-sum",
+            f"expected {expected}; got {total:.6g}: divide the weights by their "
+            "sum first, or name a PSF, if this file is an image",
         )
 
 

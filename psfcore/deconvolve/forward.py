@@ -21,7 +21,7 @@ from psfcore.deconvolve.run import BUILDING, Cards, PsfSource, UsedPsf
 from psfcore.errors import DataError
 from psfcore.fits.images import write_image
 from psfcore.image import Image
-from psfcore.instruments.psf_statements import title
+from psfcore.instruments.psf_statements import caveats, title
 from psfcore.psf import Psf
 
 
@@ -92,7 +92,9 @@ def history(found: Convolved, psf: UsedPsf) -> list[str]:
 
 
 def lines(found: Convolved, psf: UsedPsf) -> list[str]:
-    """Two lines: the PSF and the edges; the shape, the brightest pixel and the light that stays in the field."""
+    """The PSF and the edges; the caveats of the PSF, if it has some; the shape, the brightest pixel and the light that
+    stays in the field.
+    """
     ny, nx = found.pixels.shape
     before, after = (plane[found.image.finite] for plane in (found.image.pixels, found.pixels))
     kept = (
@@ -100,8 +102,10 @@ def lines(found: Convolved, psf: UsedPsf) -> list[str]:
         if before.sum() > 0
         else ""
     )
+    doubts = caveats(found.psf.name, found.psf.instrument, found.psf.provenance, convolved=True)
     return [
         found.title(psf),
+        *([f"caveats of the PSF: {'; '.join(doubts)}"] if doubts else []),
         f"{nx} x {ny} px; brightest pixel {before.max():.4g} before, {after.max():.4g} after{kept}",
     ]
 

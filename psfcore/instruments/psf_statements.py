@@ -79,9 +79,11 @@ def mesh_is_assumed(name: str, instrument: str | None, provenance: Mapping[str, 
     return _bases(name, instrument, _stated(provenance)).get("mesh_basis") == "assumed"
 
 
-def scatter_left(name: str, instrument: str | None, provenance: Mapping[str, object]) -> str | None:
-    """What a deconvolution with a PSF without diffuse scatter leaves in the image; None: the PSF contains scatter, or
-    it was not built from an instrument file.
+def scatter_left(
+    name: str, instrument: str | None, provenance: Mapping[str, object], *, convolved: bool = False
+) -> str | None:
+    """What a deconvolution with a PSF without diffuse scatter leaves in the image, or what a convolution lacks; None:
+    the PSF contains scatter, or it was not built from an instrument file.
     """
     provenance = _stated(provenance)
     bases = _bases(name, instrument, provenance)
@@ -89,7 +91,8 @@ def scatter_left(name: str, instrument: str | None, provenance: Mapping[str, obj
     if "mount_basis" not in bases or ("scatter_basis" in bases and whole):
         return None
     share = _DIFFUSE_LIGHT.get(telescope_of(name)) if name in instrument_names() else None
-    return f"the diffusely scattered light stays in the image ({share or 'its share is not known'})"
+    where = "is missing in the convolved image" if convolved else "stays in the image"
+    return f"the diffusely scattered light {where} ({share or 'its share is not known'})"
 
 
 def published_with_scatter(name: str, instrument: str | None, provenance: Mapping[str, object]) -> list[str]:
@@ -107,11 +110,14 @@ def offer(published: Sequence[str]) -> str:
     )
 
 
-def caveats(name: str, instrument: str | None, provenance: Mapping[str, object]) -> list[str]:
+def caveats(
+    name: str, instrument: str | None, provenance: Mapping[str, object], *, convolved: bool = False
+) -> list[str]:
     """What makes a result of a PSF uncertain: that it is only a component, what is assumed in it, and the scattered
-    light that it leaves.
+    light that it leaves, or with `convolved` the scattered light that a convolved image lacks.
     """
-    component, left = _stated(provenance).get("component"), scatter_left(name, instrument, provenance)
+    component = _stated(provenance).get("component")
+    left = scatter_left(name, instrument, provenance, convolved=convolved)
     only = [] if component is None else [f"only the component {component}, not the whole PSF"]
     return [*only, *assumptions(name, instrument, provenance), *([] if left is None else [left])]
 

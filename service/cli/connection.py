@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, TypeVar, cast
 import click
 from click.shell_completion import CompletionItem
 
-from psfcore.errors import did_you_mean
+from psfcore.errors import DataError, did_you_mean
 from psfcore.instruments.files import instrument_names
 from psfcore.instruments.published import PUBLISHED
 from psfcore.published_psfs import PUBLISHED_OF_IMAGE, kept_file, published_of
@@ -252,6 +252,12 @@ def named_psf(service: Operations, psf: str | None, *, image: Path | None = None
         there = None if service.server is None else service.get(f"/v1/psfs?name={psf}&limit=1")["items"]
         known = cast("list[Uploaded] | None", there)
         return (known[0] if known else service.upload_psf(kept_file(published_folder(), psf)))["id"]
+    if is_psf_id(psf) and service.server is None:
+        raise DataError(
+            "no-such-psf",
+            f"expected a file or the name of a PSF, because this command asks no service; got the id {short(psf)}: "
+            f"download the PSF first (`heliopsf psf download {short(psf)} -o FILE`)",
+        )
     if is_psf_id(psf):
         return whole_id(service, "psfs", psf)
     return service.upload_psf(psf)["id"]

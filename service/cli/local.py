@@ -294,8 +294,8 @@ class Local(Operations):
         if request.context not in (None, _NOW):
             raise DataError(
                 "no-such-context",
-                f"expected the id or name of a context; got {request.context!r}, which does not exist: list the "
-                "contexts",
+                f"expected no context, because only a service has contexts; got {request.context!r}: leave it out, or "
+                "leave out --local",
             )
         psf: dict[str, object] = {"psf_id": request.psf_id}
         if request.psf_id is None:

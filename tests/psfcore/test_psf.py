@@ -29,7 +29,7 @@ def with_pixel(value: float) -> NDArray[np.float64]:
 
 def test_a_wrong_psf_is_refused() -> None:
     for kernel, code, words in (
-        (delta(32) * 3, "psf-sum", r"got 3\."),
+        (delta(32) * 3, "psf-sum", r"got 3:"),
         (delta(32) * 0.01, "psf-sum", "got 0.01"),
         (with_pixel(np.nan), "psf-nonfinite", "got 1"),
         (with_pixel(-1e-6), "psf-negative", "-1e-06"),

@@ -71,6 +71,8 @@ def test_a_psf_that_was_read_from_a_file_says_what_it_said_when_it_was_built(tmp
 
 def test_a_published_psf_with_the_scatter_that_stays_is_offered() -> None:
     assert published_with_scatter("aia_171", "aia_171", {}) == ["aia_171_2025"]
+    left, lacks = (caveats("aia_171", "aia_171", {}, convolved=one)[-1] for one in (False, True))
+    assert "stays" in left and "missing" in lacks and "10 to 35 %" in lacks
     assert "`heliopsf psf get aia_171_2025`" in offer(["aia_171_2025"])
     for name in ("hri_euv", "trace_171", "mine"):
         assert published_with_scatter(name, name, {}) == [], name

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.io import fits
+from click.testing import CliRunner
 from fastapi.testclient import TestClient
 
 import heliopsf
@@ -25,6 +26,7 @@ from psfcore.instruments import files
 from psfcore.psf_sampling import rebinned
 from psfcore.transit.archive import pack
 from service.cli.local import local
+from service.cli.main import main
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
 from tests.service.conftest import upload
 from tests.transit_files import write_transit
@@ -175,3 +177,10 @@ def test_a_deconvolution_builds_the_total_psf_and_a_later_command_the_rest(
     assert len({(tmp_path / name).read_bytes() for name in ("first", "second", "third")}) == 1
     assert "DIFFRACTION" in heliopsf.read_psf(tmp_path / "psf.fits").components
     files.match_table.cache_clear()
+
+
+def test_an_id_or_a_context_without_a_service_is_told(image_file: Path, tmp_path: Path) -> None:
+    asked = ["deconvolve", str(image_file), "-o", str(tmp_path / "o.fits"), "--local"]
+    for option, value in (("--psf", "0123456789"), ("--context", "years")):
+        done = CliRunner().invoke(main, [*asked, option, value])
+        assert done.exit_code == 1 and "service" in done.output and value in done.output, done.output

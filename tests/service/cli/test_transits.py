@@ -231,7 +231,7 @@ def test_what_is_wrong_with_a_diagnosis_is_said_in_a_line_and_nothing_is_written
 ) -> None:
     for arguments, said in (
         (["--corrected", "no/such/folder/p.fits", "--local"], "there is no folder"),
-        (["--psf", "0" * 64, "--local"], "expected the id of one of your PSFs"),
+        (["--psf", "0" * 64, "--local"], "asks no service"),
         (["--effects", "mine.py"], "--effects: expected --local with it"),
         (["--effects", "mine.py", "--local"], "effects of mine.py: expected a readable Python file"),
         (["--effects", "no_such_module_anywhere", "--local"], "No module named 'no_such_module_anywhere'"),
