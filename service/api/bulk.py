@@ -168,7 +168,9 @@ class Result(RowView):
     reused: bool = Field(
         description="whether the product already existed, so that the image was not deconvolved"
     )
-    score: float = Field(description="artefact score; below 1: each sign of artefacts is below the level of its alarm")
+    score: float = Field(
+        description="artefact score; below 1: each sign of artefacts is below the level of its alarm"
+    )
     flux_change_pct: float
     bright: Change | None
     dark: Change | None
