@@ -79,8 +79,8 @@ print("caveats of the PSF:", "; ".join(details["psf"]["assumed"]))
 # Print and cite
 # --------------
 #
-# **Report on one page** shows the product on one sheet A4 for paper or PDF: the image and the PSF with their hashes, the
-# method, the masked pixels, the changes and the errors. **Download FITS** brings the product; its header names the PSF.
+# **Report on one page** shows the product on one sheet A4 for paper or PDF: image and PSF with their hashes, method,
+# masked pixels, changes and errors. **Download FITS** brings the product; its header names the PSF.
 #
 # Stop the service. In a terminal, press Control-C.
 
