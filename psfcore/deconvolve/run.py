@@ -171,16 +171,15 @@ class Product(Deconvolved):
         low, high = percentiles(before, [1, 99])
         dark, bright = before <= low, before >= high
         psf = used or self.psf
+        origin = (psf.name, self.psf.instrument, provenance or self.psf.provenance)
         return {
             "image": self.name,
             "psf": {
                 "name": psf.name,
                 "version": psf.version,
                 "status": psf.status,
-                "assumed": caveats(psf.name, self.psf.instrument, provenance or self.psf.provenance),
-                "published": published_with_scatter(
-                    psf.name, self.psf.instrument, provenance or self.psf.provenance
-                ),
+                "assumed": caveats(*origin),
+                "published": published_with_scatter(*origin),
             },
             "steps_done": self.steps_done,
             "stopped_because": self.stopped_because,

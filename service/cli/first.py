@@ -8,7 +8,7 @@ from itertools import islice
 from pathlib import Path
 from shlex import quote
 
-from psfcore.files import FITS_ENDING
+from psfcore.files import FITS_ENDING, fits_in
 from service.cli.progress import printable
 
 MOST_ENTRIES, MOST_FOLDERS = 1000, 100  # that are looked at
@@ -37,7 +37,7 @@ def first_screen(folder: Path) -> str:
 def _fitting(folder: Path) -> Iterator[tuple[str, str]]:
     """Commands for what lies in the folder, and what they do: for transits, for images, and for folders of images."""
     entries = sorted(islice(folder.iterdir(), MOST_ENTRIES))
-    folders = [one for one in entries if one.is_dir() and not one.name.startswith(".") and readable(one)]
+    folders = [one for one in entries if one.is_dir() and not one.name.startswith(".") and _readable(one)]
     places = [folder, *folders[:MOST_FOLDERS]]
     transits = [place for place in places if (place / "transit.json").is_file()]
     for place in transits[:1]:
@@ -58,12 +58,10 @@ def _fitting(folder: Path) -> Iterator[tuple[str, str]]:
 
 def _images(folder: Path) -> Iterator[Path]:
     """FITS files of a folder that can be images of a telescope, by the endings of their names and by their headers."""
-    entries = sorted(islice(folder.iterdir(), MOST_ENTRIES))
-    named = (one for one in entries if FITS_ENDING.search(one.name) and not one.name.startswith("."))
-    return (one for one in named if one.is_file() and readable(one) and _can_be_image(one))
+    return (one for one in fits_in(folder) if one.is_file() and _readable(one) and _can_be_image(one))
 
 
-def readable(path: Path) -> bool:
+def _readable(path: Path) -> bool:
     """Whether this user may read a file, or list a folder and open its files."""
     return os.access(path, os.R_OK | (os.X_OK if path.is_dir() else 0))
 
