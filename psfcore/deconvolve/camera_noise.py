@@ -33,7 +33,9 @@ from scipy.ndimage import binary_erosion, uniform_filter
 from scipy.special import ndtri
 
 from psfcore.arrays import Flags
-from psfcore.deconvolve.assess.artefacts import classes_of, filled, second_differences
+from psfcore.deconvolve.assess.artefacts import classes_of, second_differences
+from psfcore.deconvolve.assess.compared import filled
+from psfcore.deconvolve.assess.ranks import Portions
 from psfcore.errors import DataError
 from psfcore.fits.cards import optional_text
 from psfcore.fits.header import known_instrument
@@ -166,7 +168,7 @@ def _mean_of_lowest(values: Plane) -> float:
 
 def _transfer(pixels: Plane, counted: Flags, sigma: Plane | None) -> tuple[float, float] | None:
     """G and r of Eq. (1) in the unit of the pixels; None for too few pixels."""
-    classes = classes_of(uniform_filter(pixels, 3)[counted])
+    classes = classes_of(Portions.of(uniform_filter(pixels, 3)[counted]))
     if not classes.centres.size:
         return None
     members = [classes.numbers == number for number in range(classes.centres.size)]

@@ -32,14 +32,16 @@ the image increases this estimate, so it is an upper limit.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from typing import Any, Literal, TypeVar
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.deconvolve.assess import ranks
-from psfcore.deconvolve.edges import inside_band
+from psfcore.deconvolve.assess.compared import Compared, Places, SinglePlane, row_blocks, with_rim
+from psfcore.shares import shared_out
 
 HOLE_SHARE = 0.02
 DETECTION_SIGMA = 5.0
@@ -47,7 +49,6 @@ EXTREME_SIGMA = 8.0
 # Values from which a person should inspect the image: pixels per million, and percent of the peak of a source.
 ALARMS = {"holes_ppm": 100.0, "overshoots_ppm": 100.0, "new_extremes_ppm": 200.0, "ringing_pct": 2.0}
 RING_RADIUS_PX = 8
-_BLOCK_ROWS = 64
 _PLACES_AT_ONCE = 4096
 _MEDIAN_RADIUS_PX = 2
 _SOURCES = 100
@@ -56,9 +57,9 @@ _BRIGHTNESS_CLASSES = 16
 
 Plane = NDArray[np.floating]
 Flags = NDArray[np.bool_]
-Places = tuple[NDArray[np.intp], ...]
 NoiseAt = Callable[[Places], Plane]  # the noise of the pixels at these positions [y, x], shape (n,)
 Pixels = TypeVar("Pixels", NDArray[np.floating], NDArray[np.bool_])
+Sign = Callable[[slice], Flags]  # the pixels of some rows that show a sign
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,37 +89,49 @@ class Artefacts:
         return {"score": self.score, "sources": self.sources, "signs": self.signs, "alarms": ALARMS}
 
 
-def find_artefacts(
-    before: Plane, after: Plane, counted: Flags, peak_weight: float, *, sigma: NoiseAt | None = None
-) -> Artefacts:
-    """Find signs of artefacts in the counted pixels of `after` [y, x].
+def find_artefacts(pair: Compared, peak_weight: float, *, sigma: NoiseAt | None = None) -> Artefacts:
+    """Find signs of artefacts in the compared pixels.
 
     Parameters
     ----------
-    before, after
-        The images [y, x], finite (`filled`), in single precision, which is accurate enough and twice as fast.
+    peak_weight
+        The central weight of the PSF.
     sigma
-        Function that returns the noise of `before` at positions [y, x], in the unit of `before`; None: the noise is
-        estimated from the pixels.
+        Function that returns the noise before the deconvolution at positions [y, x], in the unit of the image; None:
+        the noise is estimated from the pixels.
     """
-    classes = classes_of(before[counted])
-    noise_after = noise_levels(after, counted, classes)
-    noise_before = sigma or _estimated_noise(before, counted, classes)
-    holes = _holes(before, after, counted, noise_before)
-    overshoots = _overshoots(before, after, counted, noise_before, peak_weight)
-    extremes = _new_extremes(before, after, counted, noise_before, noise_after)
-    ringing, sources = ringing_pct(before, after, counted)
-    area = max(1, int(np.count_nonzero(counted)))
-    signs: dict[str, float | None] = {
-        "holes_ppm": 1e6 * int(np.count_nonzero(holes)) / area,
-        "overshoots_ppm": 1e6 * int(np.count_nonzero(overshoots)) / area,
-        "new_extremes_ppm": 1e6 * int(np.count_nonzero(extremes)) / area,
-        "ringing_pct": ringing,
-    }
+    before = pair.before
+    classes = classes_of(pair.portions(before.__getitem__))
+    noise_after = noise_levels(pair, pair.after, classes)
+    noise_before = sigma or _estimated_noise(pair, classes)
+    suspected = np.zeros_like(pair.counted)
+    counts: dict[str, int] = {}
+    for name, sign in (
+        ("holes_ppm", _holes(pair, noise_before)),
+        ("overshoots_ppm", _overshoots(pair, noise_before, peak_weight)),
+        ("new_extremes_ppm", _new_extremes(pair, noise_before, noise_after)),
+    ):
+        counts[name] = _marked(pair, sign, suspected)
+    ringing, sources = ringing_pct(pair)
+    area = max(1, int(pair.sizes.sum()))
+    signs: dict[str, float | None] = {name: 1e6 * count / area for name, count in counts.items()}
+    signs["ringing_pct"] = ringing
     score = sum((signs[name] or 0.0) / alarm for name, alarm in ALARMS.items())
-    return Artefacts(
-        suspected=holes | overshoots | extremes, signs=signs, sources=sources, score=float(score)
-    )
+    return Artefacts(suspected=suspected, signs=signs, sources=sources, score=float(score))
+
+
+def _marked(pair: Compared, sign: Sign, suspected: Flags) -> int:
+    """Add the pixels with a sign to the suspected ones; the number of pixels with this sign."""
+
+    def marked(share: range) -> int:
+        count = 0
+        for n in share:
+            found = sign(pair.blocks[n])
+            suspected[pair.blocks[n]] |= found
+            count += int(np.count_nonzero(found))
+        return count
+
+    return sum(shared_out(marked, len(pair.blocks), pair.threads))
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,13 +150,12 @@ class BrightnessClasses:
     centres: NDArray[np.float64]
 
 
-def classes_of(brightness: Plane) -> BrightnessClasses:
+def classes_of(brightness: ranks.Portions) -> BrightnessClasses:
     """Divide pixels into classes by their brightness (n,). With fewer than 16 pixels there are no classes."""
-    values = np.asarray(brightness, dtype=np.float32)
-    if values.size < _BRIGHTNESS_CLASSES:
-        return BrightnessClasses(np.zeros(values.size, np.uint8), np.empty(0))
-    numbers = ranks.parts_of_equal_size(values, _BRIGHTNESS_CLASSES)
-    return BrightnessClasses(numbers, ranks.medians(values, numbers, _BRIGHTNESS_CLASSES))
+    count = int(brightness.sizes.sum())
+    if count < _BRIGHTNESS_CLASSES:
+        return BrightnessClasses(np.zeros(count, np.uint8), np.empty(0))
+    return BrightnessClasses(*ranks.parts_of_equal_size(brightness, _BRIGHTNESS_CLASSES))
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,115 +190,106 @@ class NoiseLevels:
         return np.asarray(np.maximum(np.interp(brightness, centres, self.levels) * beyond, self.smallest))
 
 
-def noise_levels(pixels: Plane, counted: Flags, classes: BrightnessClasses) -> NoiseLevels:
-    """Upper limit of the noise of `pixels` [y, x], which must be finite."""
-    second = second_differences(pixels, counted).astype(np.float32, copy=False)
-    smallest = 1e-6 * max(float(pixels.max()), -float(pixels.min())) + np.finfo(float).tiny
-    levels = 1.4826 * ranks.medians(second, classes.numbers, classes.centres.size)
-    return NoiseLevels(classes.centres, levels, smallest)
+def noise_levels(pair: Compared, plane: SinglePlane, classes: BrightnessClasses) -> NoiseLevels:
+    """Upper limit of the noise of one of the planes of a pair."""
+    second = pair.portions(partial(_second_differences, plane), classes.numbers)
+    levels = 1.4826 * ranks.medians(second, classes.centres.size)
+    largest = max(float(np.abs(plane[rows]).max()) for rows in pair.blocks)
+    return NoiseLevels(classes.centres, levels, 1e-6 * largest + np.finfo(float).tiny)
 
 
-def _estimated_noise(pixels: Plane, counted: Flags, classes: BrightnessClasses) -> NoiseAt:
-    """The noise of pixels, estimated from the pixels themselves, as a function of their brightness."""
-    levels = noise_levels(pixels, counted, classes)
-    return lambda at: levels.at(pixels[at])
+def _estimated_noise(pair: Compared, classes: BrightnessClasses) -> NoiseAt:
+    """The noise before the deconvolution, estimated from the pixels themselves, as a function of their brightness."""
+    levels = noise_levels(pair, pair.before, classes)
+    return lambda at: levels.at(pair.before[at])
 
 
 def second_differences(plane: Plane, counted: Flags) -> Plane:
     """The absolute second difference along both axes, divided by 6, of the counted pixels (n,); the plane is mirrored
     at its edges. Sums are in double precision.
     """
-    differences = np.empty(np.count_nonzero(counted), plane.dtype)
-    first = 0
-    for rows, block in _blocks_with_rim(plane, 1, "symmetric"):
-        double = block.astype(np.float64)
-        along_y = double[:-2] - 2 * double[1:-1] + double[2:]
-        both = along_y[:, :-2] - 2 * along_y[:, 1:-1] + along_y[:, 2:]
-        chosen = np.abs(both[counted[rows]])
-        differences[first : first + chosen.size] = chosen / 6
-        first += chosen.size
-    return differences
+    return np.concatenate(
+        [_second_differences(plane, rows)[counted[rows]] for rows in row_blocks(len(counted))]
+    )
 
 
-def row_blocks(count: int) -> Iterator[slice]:
-    """All rows [0, count) in blocks that stay in the processor's cache."""
-    for top in range(0, count, _BLOCK_ROWS):
-        yield slice(top, min(top + _BLOCK_ROWS, count))
+def _second_differences(plane: Plane | SinglePlane, rows: slice) -> Plane:
+    """The absolute second differences of some rows [y, x]."""
+    double = with_rim(plane, rows, 1, "symmetric").astype(np.float64)
+    along_y = double[:-2] - 2 * double[1:-1] + double[2:]
+    both = along_y[:, :-2] - 2 * along_y[:, 1:-1] + along_y[:, 2:]
+    np.abs(both, out=both)
+    both /= 6
+    return np.asarray(both)
 
 
-def _blocks_with_rim(
-    plane: Pixels, rim_px: int, rim: Literal["edge", "symmetric"]
-) -> Iterator[tuple[slice, Pixels]]:
-    """The blocks of `row_blocks`, and their pixels with a rim on all sides.
-
-    Parameters
-    ----------
-    rim
-        How the rim is filled, as a mode of `numpy.pad`.
-    """
-    for rows in row_blocks(len(plane)):
-        first, last = max(rows.start - rim_px, 0), min(rows.stop + rim_px, len(plane))
-        missing = (rim_px - (rows.start - first), rim_px - (last - rows.stop))
-        yield rows, np.pad(plane[first:last], (missing, (rim_px, rim_px)), mode=rim)
-
-
-def ringing_pct(before: Plane, after: Plane, counted: Flags) -> tuple[float | None, int]:
+def ringing_pct(pair: Compared) -> tuple[float | None, int]:
     """Compute Eq. (4); also return the number of bright sources. With fewer than three sources, Eq. (4) is None."""
-    sources = _bright_sources(before, counted)
+    sources = _bright_sources(pair)
     if len(sources) < _FEWEST_SOURCES:
         return None, len(sources)
-    rise_after, rise_before = (_rise(_mean_profile(plane, sources)) for plane in (after, before))
+    rise_after, rise_before = (_rise(_mean_profile(plane, sources)) for plane in (pair.after, pair.before))
     return 100 * max(0.0, rise_after - rise_before), len(sources)
 
 
 # The noise is computed only for the pixels that the other conditions leave. These are few in most images, but they may
-# be all pixels, so each function looks at a block of rows at a time.
+# be all pixels, so each sign is looked for in a block of rows at a time.
 
 
-def _holes(before: Plane, after: Plane, counted: Flags, noise_before: NoiseAt) -> Flags:
-    """Find the counted pixels that fulfil Eq. (1)."""
-    holes = np.zeros_like(counted)
-    for rows in row_blocks(len(before)):
-        y, x = np.nonzero(counted[rows] & (after[rows] < HOLE_SHARE * before[rows]))
+def _holes(pair: Compared, noise_before: NoiseAt) -> Sign:
+    """The compared pixels that fulfil Eq. (1)."""
+
+    def holes(rows: slice) -> Flags:
+        before = pair.before[rows]
+        found = (pair.after[rows] < HOLE_SHARE * before) & (before > 0)
+        found &= pair.counted[rows]
+        y, x = np.nonzero(found)
         places = (y + rows.start, x)
-        holes[places] = before[places] > DETECTION_SIGMA * noise_before(places)
+        found[y, x] = pair.before[places] > DETECTION_SIGMA * noise_before(places)
+        return found
+
     return holes
 
 
-def _overshoots(
-    before: Plane, after: Plane, counted: Flags, noise_before: NoiseAt, peak_weight: float
-) -> Flags:
-    """Find the counted pixels that fulfil Eq. (2)."""
-    overshoots = np.zeros_like(counted)
-    for rows in row_blocks(len(before)):
-        y, x = np.nonzero(counted[rows] & (after[rows] > before[rows].astype(np.float64) / peak_weight))
+def _overshoots(pair: Compared, noise_before: NoiseAt, peak_weight: float) -> Sign:
+    """The compared pixels that fulfil Eq. (2)."""
+
+    def overshoots(rows: slice) -> Flags:
+        found = pair.counted[rows] & (pair.after[rows] > pair.before[rows].astype(np.float64) / peak_weight)
+        y, x = np.nonzero(found)
         places = (y + rows.start, x)
-        limit = (before[places] + DETECTION_SIGMA * noise_before(places)) / peak_weight
-        overshoots[places] = after[places] > limit
+        limit = (pair.before[places] + DETECTION_SIGMA * noise_before(places)) / peak_weight
+        found[y, x] = pair.after[places] > limit
+        return found
+
     return overshoots
 
 
-def _new_extremes(
-    before: Plane, after: Plane, counted: Flags, noise_before: NoiseAt, noise_after: NoiseLevels
-) -> Flags:
-    """Find the counted pixels that fulfil Eq. (3).
+def _new_extremes(pair: Compared, noise_before: NoiseAt, noise_after: NoiseLevels) -> Sign:
+    """The compared pixels that fulfil Eq. (3).
 
     A median lies between the minimum and the maximum of its pixels. If a pixel differs from both by less than the
     limit, it cannot fulfil Eq. (3). Medians are therefore needed only for the pixels that are left.
     """
-    extremes = np.zeros_like(counted)
-    blocks = (_blocks_with_rim(plane, _MEDIAN_RADIUS_PX, "symmetric") for plane in (before, after))
-    for (rows, block_before), (_, block) in zip(*blocks, strict=True):
+
+    def extremes(rows: slice) -> Flags:
+        block_before, block = (
+            with_rim(plane, rows, _MEDIAN_RADIUS_PX, "symmetric") for plane in (pair.before, pair.after)
+        )
+        before, counted = pair.before[rows], pair.counted[rows]
+        found = np.zeros_like(counted)
         for sign in (1, -1):
-            y, x = _peaks(block, before[rows], noise_after, sign)
-            counted_here = counted[rows][y, x]
+            y, x = _peaks(block, before, noise_after, sign)
+            counted_here = counted[y, x]
             for portion in _portions(y[counted_here], x[counted_here]):
-                places = (portion[0] + rows.start, portion[1])
-                limit = EXTREME_SIGMA * noise_after.at(before[places])
+                limit = EXTREME_SIGMA * noise_after.at(before[portion])
                 away_after = sign * _differences(block, portion) > limit[:, None]
                 # A real peak or pit is also visible in the image before, except for the noise.
-                smooth_before = sign * _differences(block_before, portion) < noise_before(places)[:, None]
-                extremes[places] |= _mostly(away_after) & _mostly(smooth_before)
+                noise = noise_before((portion[0] + rows.start, portion[1]))
+                smooth_before = sign * _differences(block_before, portion) < noise[:, None]
+                found[portion] |= _mostly(away_after) & _mostly(smooth_before)
+        return found
+
     return extremes
 
 
@@ -355,11 +358,12 @@ def _slid(rows: Pixels, count: int, chosen: np.ufunc) -> Pixels:
     return rows
 
 
-def _bright_sources(before: Plane, counted: Flags) -> NDArray[np.int64]:
+def _bright_sources(pair: Compared) -> NDArray[np.int64]:
     """Positions [y, x] of the brightest compact peaks, shape (n, 2): those that are more than twice as bright as the
     circle around them.
     """
-    peaks = np.argwhere(_first_of_equals(_largest_around(before, counted)))
+    before = pair.before
+    peaks = np.argwhere(_first_of_equals(pair, _largest_around(pair)))
     peaks = peaks[np.argsort(-before[tuple(peaks.T)], kind="stable")]
     sources = peaks[:0]
     for (portion,) in _portions(peaks):  # the brightest first: hardly ever is more than one portion needed
@@ -370,37 +374,54 @@ def _bright_sources(before: Plane, counted: Flags) -> NDArray[np.int64]:
     return sources
 
 
-def _largest_around(plane: Plane, counted: Flags) -> Flags:
+def _largest_around(pair: Compared) -> Flags:
     """Find the pixels [y, x] that are the largest within RING_RADIUS_PX along both axes, where all pixels are
-    counted and inside the plane.
+    compared and inside the plane.
     """
-    largest = np.zeros_like(counted)
-    blocks = zip(
-        _blocks_with_rim(plane, RING_RADIUS_PX, "edge"),
-        _blocks_with_rim(counted, RING_RADIUS_PX, "edge"),
-        strict=True,
-    )
-    for (rows, block), (_, counted_block) in blocks:
-        largest[rows] = plane[rows] == _within(block, RING_RADIUS_PX, np.maximum)
-        largest[rows] &= _within(counted_block, RING_RADIUS_PX, np.minimum)
-    inside = inside_band(largest.shape, RING_RADIUS_PX)
-    return np.asarray(largest & inside)
+    counted, radius = pair.counted, RING_RADIUS_PX
+
+    def largest(rows: slice) -> Flags:
+        block = with_rim(pair.before, rows, radius, "edge")
+        found = block[radius:-radius, radius:-radius] == _within(block, radius, np.maximum)
+        if not counted[max(rows.start - radius, 0) : rows.stop + radius].all():
+            found &= _within(with_rim(counted, rows, radius, "edge"), radius, np.minimum)
+        found[:, :radius] = found[:, -radius:] = False
+        return np.asarray(found)
+
+    found = _by_rows(pair, largest)
+    found[:radius] = found[-radius:] = False
+    return found
 
 
-def _first_of_equals(largest: Flags) -> Flags:
+def _by_rows(pair: Compared, of: Sign) -> Flags:
+    """The flags [y, x] that a function finds in blocks of rows."""
+    flags = np.empty_like(pair.counted)
+
+    def found(share: range) -> None:
+        for n in share:
+            flags[pair.blocks[n]] = of(pair.blocks[n])
+
+    shared_out(found, len(pair.blocks), pair.threads)
+    return flags
+
+
+def _first_of_equals(pair: Compared, largest: Flags) -> Flags:
     """Of the largest pixels [y, x] around, those without another one in the rows above or to the left, within
     RING_RADIUS_PX along both axes. Two such pixels are equally bright. A plateau would otherwise have as many peaks as
     pixels.
     """
-    first, radius = np.zeros_like(largest), RING_RADIUS_PX
-    for rows, block in _blocks_with_rim(largest, radius, "edge"):
+    radius = RING_RADIUS_PX
+
+    def first(rows: slice) -> Flags:
+        block = with_rim(largest, rows, radius, "edge")
         above = _slid(_slid(block[: -radius - 1], radius, np.maximum).T, 2 * radius + 1, np.maximum).T
         left = _slid(block[radius:-radius, : -radius - 1].T, radius, np.maximum).T
-        first[rows] = largest[rows] & ~(above | left)
-    return first
+        return np.asarray(largest[rows] & ~(above | left))
+
+    return _by_rows(pair, first)
 
 
-def _median_on_circle(plane: Plane, places: NDArray[np.int64]) -> Plane:
+def _median_on_circle(plane: SinglePlane, places: NDArray[np.int64]) -> Plane:
     """Median of sixteen pixels on a circle around each position [y, x] in `places`."""
     angle = np.arange(16) * np.pi / 8
     rows = places[:, :1] + np.rint(RING_RADIUS_PX * np.sin(angle)).astype(int)
@@ -408,7 +429,7 @@ def _median_on_circle(plane: Plane, places: NDArray[np.int64]) -> Plane:
     return np.asarray(np.median(plane[rows, columns], axis=1))
 
 
-def _mean_profile(plane: Plane, sources: NDArray[np.int64]) -> Plane:
+def _mean_profile(plane: SinglePlane, sources: NDArray[np.int64]) -> Plane:
     """Mean radial profile of the sources.
 
     The profile of a source is the mean of each ring minus the mean of the outermost ring, scaled to a peak of 1. The
@@ -420,7 +441,7 @@ def _mean_profile(plane: Plane, sources: NDArray[np.int64]) -> Plane:
     count = np.bincount(ring[inside])
     profiles = []
     for y, x in sources:
-        stamp = plane[y + offset[0] : y + offset[-1] + 1, x + offset[0] : x + offset[-1] + 1].ravel()
+        stamp = plane[y + offset[0] : y + offset[-1] + 1][:, x + offset[0] : x + offset[-1] + 1].ravel()
         means = np.bincount(ring[inside], weights=stamp[inside]) / count
         height = means[0] - means[-1]
         if height > 0:
@@ -435,11 +456,3 @@ def _rise(profile: Plane) -> float:
         return 0.0
     dip = int(falls[0])
     return float(profile[dip + 1 :].max() - profile[dip])
-
-
-def filled(plane: Plane) -> Plane:
-    """Replace the pixels of a plane that are not finite by the median of the finite pixels."""
-    good = np.isfinite(plane)
-    if good.all():
-        return plane
-    return np.where(good, plane, float(np.median(plane[good])) if good.any() else 0.0)

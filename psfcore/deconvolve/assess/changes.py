@@ -20,24 +20,25 @@ The quality plane has one bit for each reason to use a pixel of a deconvolved im
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from enum import IntFlag
-from functools import partial
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.deconvolve.assess import ranks
-from psfcore.deconvolve.assess.artefacts import Artefacts, NoiseAt, filled, find_artefacts, row_blocks
+from psfcore.deconvolve.assess.artefacts import Artefacts, NoiseAt, find_artefacts
+from psfcore.deconvolve.assess.compared import Compared, SinglePlane, chosen
 from psfcore.deconvolve.edges import inside_band
 from psfcore.errors import DataError
 from psfcore.fits.units import dn_per_unit
 from psfcore.image import Image, MaskBit
 from psfcore.noise import Noise
 from psfcore.psf import Psf
+from psfcore.shares import shared_out
 
 BLOCKS_PX = (1, 4, 8, 16, 32)  # powers of 2
 TAILS_PCT = (5.0, 1.0, 0.1)
@@ -157,7 +158,7 @@ def measure_changes(
     noise
         Noise of the camera; if it is None, the artefact check estimates the noise from the pixels.
     threads
-        Number of threads; with 2 or more, a second thread runs the artefact check.
+        Number of threads; it does not change the result.
     """
     if result.shape != image.pixels.shape:
         raise DataError("field-shape", f"expected a result of {image.pixels.shape}; got {result.shape}")
@@ -168,34 +169,28 @@ def measure_changes(
         )
     sigma = None if noise is None else _noise_at(image, noise)
     centre = (psf.kernel.shape[0] // 2, psf.kernel.shape[1] // 2)
-    peak_weight = float(psf.kernel[centre])
-    # Single precision is accurate enough for ranks and filters, and takes half the memory.
-    seen, sharp = (filled(plane).astype(np.float32, copy=False) for plane in (image.pixels, result))
-    check = partial(find_artefacts, seen, sharp, counted, peak_weight, sigma=sigma)
-    with ThreadPoolExecutor(1) as beside:
-        # The filters of the artefact check run at the same time as the percentiles.
-        artefacts = beside.submit(check).result if threads > 1 else check
-        before, after = (plane.ravel() if counted.all() else plane[counted] for plane in (seen, sharp))
-        positive = counted & (image.pixels > 0)
-        change_pct = _percentiles(image.pixels, result, positive, _change_pct) if positive.any() else {}
-        difference = _percentiles(image.pixels, result, counted, lambda old, new: new - old)
-        blocks = [_described(before, after, 1), *_larger_blocks(image.pixels, result, counted)]
-        structures = tuple(row for part in blocks for row in _structures(part))
-        ranges = tuple(row for part in blocks for row in _ranges(part))
+    pair = Compared(SinglePlane(image.pixels), SinglePlane(result), counted, threads)
+    above = replace(pair, counted=counted & (image.pixels > 0))
+    blocks = [_pixels(pair), *_larger_blocks(image.pixels, result, pair)]
     light_before, light_after = (
         float(plane.sum(dtype=np.float64, where=counted)) for plane in (image.pixels, result)
     )
+    pixels, positive = (int(one.sizes.sum()) for one in (pair, above))
     return Changes(
-        pixels=before.size,
+        pixels=pixels,
         edge_px=edge_px,
         flux_change_pct=100 * (light_after - light_before) / (abs(light_before) or 1.0),
-        change_pct=change_pct,
-        difference=difference,
-        not_positive_before=before.size - int(np.count_nonzero(positive)),
-        not_positive_after=int(np.count_nonzero(after <= 0)),
-        structures=structures,
-        ranges=ranges,
-        artefacts=artefacts(),
+        change_pct=_percentiles(above, lambda rows: _change_pct(image.pixels[rows], result[rows]))
+        if positive
+        else {},
+        difference=_percentiles(pair, lambda rows: result[rows] - image.pixels[rows]),
+        not_positive_before=pixels - positive,
+        not_positive_after=sum(
+            int(np.count_nonzero(counted[rows] & (result[rows] <= 0))) for rows in pair.blocks
+        ),
+        structures=tuple(row for part in blocks for row in _structures(part)),
+        ranges=tuple(row for part in blocks for row in _ranges(part)),
+        artefacts=find_artefacts(pair, float(psf.kernel[centre]), sigma=sigma),
     )
 
 
@@ -228,31 +223,88 @@ def _in_blocks(plane: NDArray[Pixel], block_px: int) -> NDArray[Pixel]:
 
 @dataclass(frozen=True, eq=False)
 class _Blocks:
-    """Block means (n,) before and after deconvolution, and their lower and upper percentile for each tail."""
+    """Block means before and after deconvolution, in portions of the same sizes."""
 
     block_px: int
-    old: Means
-    new: Means
-    old_levels: dict[float, tuple[float, float]]
-    new_levels: dict[float, tuple[float, float]]
+    old: ranks.Portions
+    new: ranks.Portions
+
+    @property
+    def count(self) -> int:
+        """The number of blocks."""
+        return int(self.old.sizes.sum())
 
     @property
     def tails(self) -> list[float]:
         """The tails (percent of the blocks) that contain at least one block."""
-        return [tail for tail in TAILS_PCT if self.old.size * tail >= 100]
+        return [tail for tail in TAILS_PCT if self.count * tail >= 100]
+
+    @cached_property
+    def old_levels(self) -> dict[float, tuple[float, float]]:
+        """For each tail, its lower and its upper percentile before deconvolution."""
+        return _levels(self.old)
+
+    @cached_property
+    def new_levels(self) -> dict[float, tuple[float, float]]:
+        """The same after deconvolution."""
+        return _levels(self.new)
+
+    @cached_property
+    def in_tails(self) -> tuple[Means, Means]:
+        """The means of the blocks of the largest tails, before and after deconvolution."""
+        low, high = self.old_levels[max(self.tails)]
+
+        def share(numbers: range) -> list[tuple[int, Means, Means]]:
+            found = []
+            for n in numbers:
+                old = self.old.read(n)
+                tails = (old <= low) | (old >= high)
+                found.append((n, old[tails], self.new.read(n)[tails]))
+            return found
+
+        parts = [part for one in shared_out(share, len(self.old.sizes), self.old.threads) for part in one]
+        _, old, new = zip(*sorted(parts, key=lambda part: part[0]), strict=True)
+        return np.concatenate(old), np.concatenate(new)
 
 
-def _larger_blocks(before: Plane, after: Plane, counted: Flags) -> Iterator[_Blocks]:
-    """The blocks whose pixels are all counted, for each size of BLOCKS_PX above 1. The sums of a size are those of half
-    the size, added.
+def _pixels(pair: Compared) -> _Blocks:
+    """The compared pixels, as blocks of one pixel."""
+    return _Blocks(1, *(pair.portions(plane.__getitem__) for plane in (pair.before, pair.after)))
+
+
+def _larger_blocks(before: Plane, after: Plane, pair: Compared) -> list[_Blocks]:
+    """The blocks whose pixels are all compared, for each size of BLOCKS_PX above 1. The sums of a size are those of
+    half the size, added.
     """
-    block_px = 1
+    sizes = [size for size in BLOCKS_PX if size > 1]
+
+    def share(numbers: range) -> list[tuple[int, list[Means]]]:
+        return [(n, _means_of_rows(before, after, pair, pair.blocks[n])) for n in numbers]
+
+    parts = [part for one in shared_out(share, len(pair.blocks), pair.threads) for part in one]
+    of_rows = [means for _, means in sorted(parts, key=lambda part: part[0])]
+    found = []
+    for k, block_px in enumerate(sizes):
+        both = np.concatenate([means[k] for means in of_rows], axis=1)
+        found.append(_Blocks(block_px, *map(ranks.Portions.of, both)))
+    return found
+
+
+def _means_of_rows(before: Plane, after: Plane, pair: Compared, rows: slice) -> list[Means]:
+    """The block means before and after, (2, n), of some rows, for each size of BLOCKS_PX above 1.
+
+    The number of rows is a multiple of the largest size, except for the last rows of an image.
+    """
+    old, new, counted, block_px = before[rows], after[rows], pair.counted[rows], 1
+    found = []
     while block_px < BLOCKS_PX[-1]:
         with np.errstate(invalid="ignore"):  # a block with infinite pixels is not whole
-            before, after = _joined(before, np.add), _joined(after, np.add)
+            old, new = _joined(old, np.add), _joined(new, np.add)
         counted, block_px = _joined(counted, np.logical_and), 2 * block_px
         if block_px in BLOCKS_PX:
-            yield _described(before[counted] / block_px**2, after[counted] / block_px**2, block_px)
+            means = [chosen(plane, counted) / block_px**2 for plane in (old, new)]
+            found.append(np.array(means, dtype=np.float32))
+    return found
 
 
 def _joined(plane: NDArray[Pixel], join: np.ufunc) -> NDArray[Pixel]:
@@ -262,16 +314,8 @@ def _joined(plane: NDArray[Pixel], join: np.ufunc) -> NDArray[Pixel]:
     return np.asarray(join(rows[:, 0:nx:2], rows[:, 1:nx:2]))
 
 
-def _described(old: Plane | Means, new: Plane | Means, block_px: int) -> _Blocks:
-    """The blocks with these means (n,), in single precision."""
-    before, after = (np.asarray(means, dtype=np.float32) for means in (old, new))
-    return _Blocks(block_px, before, after, _levels(before), _levels(after))
-
-
-def _levels(means: Means) -> dict[float, tuple[float, float]]:
+def _levels(means: ranks.Portions) -> dict[float, tuple[float, float]]:
     """For each tail of p percent: (percentile p, percentile 100 - p) of the block means."""
-    if means.size == 0:
-        return {}
     levels = ranks.percentiles(means, [level for tail in TAILS_PCT for level in (tail, 100 - tail)]).tolist()
     return {tail: (levels[2 * k], levels[2 * k + 1]) for k, tail in enumerate(TAILS_PCT)}
 
@@ -279,9 +323,7 @@ def _levels(means: Means) -> dict[float, tuple[float, float]]:
 def _structures(blocks: _Blocks) -> list[Structure]:
     if not blocks.tails:
         return []
-    low, high = blocks.old_levels[max(blocks.tails)]
-    tails = (blocks.old <= low) | (blocks.old >= high)
-    old, new = (means if tails.all() else means[tails] for means in (blocks.old, blocks.new))
+    old, new = blocks.in_tails
     rows = []
     of_level: dict[tuple[str, float], Structure | None] = {}  # on a plateau, all tails have the same level
     for tail, kind in ((tail, kind) for tail in blocks.tails for kind in ("bright", "dark")):
@@ -351,23 +393,31 @@ def _dynamic_range(low: float, high: float) -> float | None:
     return float(high / low) if low > 0 else None  # Eq. (2)
 
 
-def _contrast(means: Means) -> float | None:
-    mean = float(means.mean())
-    return float(means.std()) / mean if mean > 0 else None
+def _contrast(means: ranks.Portions) -> float | None:
+    count = int(means.sizes.sum())
+    mean = _total(means, lambda values: values) / count
+    if mean <= 0:
+        return None
+    return float(np.sqrt(_total(means, lambda values: (values - mean) ** 2) / count)) / mean
 
 
-def _percentiles(
-    before: Plane, after: Plane, chosen: Flags, compare: Callable[[Plane, Plane], Plane]
-) -> dict[str, float]:
-    """Percentiles of what `compare` gives for the chosen pixels, before and after deconvolution."""
-    values = np.empty(np.count_nonzero(chosen), np.float32)
-    first = 0
-    for rows in row_blocks(len(chosen)):
-        which = np.s_[:] if chosen[rows].all() else chosen[rows]
-        block = compare(before[rows][which], after[rows][which]).ravel()
-        values[first : first + block.size] = block
-        first += block.size
-    levels = ranks.percentiles(values, CHANGE_PERCENTILES)
+def _total(means: ranks.Portions, of: Callable[[Plane], Plane]) -> float:
+    """The sum of a function of all numbers, in double precision."""
+
+    def share(numbers: range) -> float:
+        return sum(float(of(means.read(n).astype(np.float64)).sum()) for n in numbers)
+
+    return sum(shared_out(share, len(means.sizes), means.threads))
+
+
+def _percentiles(pair: Compared, of: Callable[[slice], Plane]) -> dict[str, float]:
+    """Percentiles of what `of` gives for the compared pixels of some rows."""
+
+    def numbers(rows: slice) -> Plane:
+        with np.errstate(divide="ignore", invalid="ignore"):  # of pixels that are not compared
+            return of(rows)
+
+    levels = ranks.percentiles(pair.portions(numbers), CHANGE_PERCENTILES)
     return {f"p{level:g}": float(value) for level, value in zip(CHANGE_PERCENTILES, levels, strict=True)}
 
 

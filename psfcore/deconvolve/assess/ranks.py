@@ -2,150 +2,244 @@
 
 The bits of a float32, read as an integer, order the numbers above 0 by their values and those below 0 in reverse; with
 the latter turned around, this integer is called the key. A histogram of the upper 16 bits of the keys tells in which
-bin each rank lies. Only the values in these bins, usually a few percent of all, are sorted.
+bin each rank lies, and histograms of the lower 16 bits in these bins tell the value. The numbers are read twice and in
+portions, so they need not be in memory together.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.compiled import compiled
+from psfcore.shares import shared_out
 
 Values = NDArray[np.float32]
 Groups = NDArray[np.uint8]
+Counts = NDArray[np.int32]
 _BINS, _SHIFT = 1 << 16, 16
-_MINUS_ZERO = -(1 << 31)
+_MINUS_ZERO, _LOWER_31 = -(1 << 31), (1 << 31) - 1
 _LARGEST = float(np.finfo(np.float32).max)
+_PORTION = 1 << 18
 
 
-def percentiles(values: NDArray[np.generic], levels: Sequence[float]) -> NDArray[np.float64]:
-    """The percentiles of values (n,), which must not be NaN, as `numpy.percentile` computes them, in single
-    precision.
-    """
-    with np.errstate(over="ignore"):
-        single = np.asarray(values, dtype=np.float32)
-    place = (single.size - 1) * np.asarray(levels) / 100
-    rank = place.astype(np.intp)
-    ((found, _),) = _at_ranks(
-        single, np.zeros(single.size, np.uint8), [[*rank, *np.minimum(rank + 1, single.size - 1)]]
-    )
-    low, high = np.split(np.clip(found.astype(np.float64), -_LARGEST, _LARGEST), 2)
-    return np.asarray(low + (high - low) * (place - rank))
+@dataclass(frozen=True, eq=False)
+class Portions:
+    """Numbers that are made in portions each time they are read, and the group of each number.
 
-
-def medians(values: Values, groups: Groups, count: int) -> NDArray[np.float64]:
-    """The median of the values (n,) of each of `count` groups.
-
-    Parameters
+    Attributes
     ----------
+    sizes
+        The number of numbers in each portion.
+    read
+        Function of the number of a portion that returns its numbers, none of them NaN.
     groups
-        The number of the group of each value; no group is empty.
+        The group of each number (n,); None: all are in group 0.
+    threads
+        Number of threads that read.
     """
+
+    sizes: NDArray[np.intp]
+    read: Callable[[int], Values]
+    groups: Groups | None = None
+    threads: int = 1
+
+    @classmethod
+    def of(cls, values: NDArray[np.generic]) -> Portions:
+        """The portions of an array (n,), in single precision."""
+        with np.errstate(over="ignore"):
+            single = np.asarray(values, dtype=np.float32)
+        starts = np.arange(0, max(single.size, 1), _PORTION)
+        sizes = np.minimum(single.size - starts, _PORTION)
+        return cls(sizes, lambda n: single[n * _PORTION : (n + 1) * _PORTION])
+
+    @cached_property
+    def ends(self) -> NDArray[np.intp]:
+        """Where each portion ends among all numbers."""
+        return np.cumsum(self.sizes)
+
+    def portion(self, n: int) -> tuple[Values, Groups]:
+        """The numbers and the groups of a portion."""
+        values = self.read(n)
+        if self.groups is None:
+            return values, np.zeros(values.size, np.uint8)
+        return values, self.groups[self.ends[n] - values.size : self.ends[n]]
+
+
+def percentiles(values: NDArray[np.generic] | Portions, levels: Sequence[float]) -> NDArray[np.float64]:
+    """The percentiles of numbers, none of them NaN, as `numpy.percentile` computes them, in single precision."""
+    portions = values if isinstance(values, Portions) else Portions.of(values)
+
+    def place(size: int) -> NDArray[np.float64]:
+        return np.asarray((size - 1) * np.asarray(levels) / 100)
+
+    def neighbours(size: int) -> list[int]:
+        rank = place(size).astype(np.intp)
+        return [*rank.tolist(), *np.minimum(rank + 1, size - 1).tolist()]
+
+    ((size, found, _),) = _at_ranks(portions, 1, neighbours)
+    low, high = np.split(np.clip(found.astype(np.float64), -_LARGEST, _LARGEST), 2)
+    return np.asarray(low + (high - low) * (place(size) % 1))
+
+
+def medians(portions: Portions, count: int) -> NDArray[np.float64]:
+    """The median of the numbers of each of `count` groups; no group is empty."""
     if count == 0:
         return np.empty(0)
-    sizes = np.bincount(groups, minlength=count)
-    middles = [[(size - 1) // 2, size // 2] for size in sizes.tolist()]
-    return np.array([pair.mean(dtype=np.float64) for pair, _ in _at_ranks(values, groups, middles)])
+    found = _at_ranks(portions, count, lambda size: [(size - 1) // 2, size // 2])
+    return np.array([pair.mean(dtype=np.float64) for _, pair, _ in found])
 
 
-def parts_of_equal_size(values: Values, count: int) -> Groups:
-    """The number of the part to which each value (n,) belongs, if the sorted values are cut into `count` parts.
+def parts_of_equal_size(portions: Portions, count: int) -> tuple[Groups, NDArray[np.float64]]:
+    """The number of the part to which each number (n,) belongs, if the sorted numbers are cut into `count` parts, and
+    the median of each part (count,).
 
-    The sizes of the parts differ by at most 1. Of equal values at a border, the first ones belong to the lower part.
+    The sizes of the parts differ by at most 1; none is empty, so there are at least `count` numbers. Of equal numbers
+    at a border, the first ones belong to the lower part.
     """
-    size, more = divmod(values.size, count)
-    starts = np.cumsum(size + (np.arange(count - 1) < more))
-    parts = np.zeros(values.size, np.uint8)
-    ((borders, below),) = _at_ranks(values, parts, [starts.tolist()])
-    _cut(values, borders, starts - below, parts)
-    return parts
+
+    def starts(size: int) -> NDArray[np.intp]:
+        each, more = divmod(size, count)
+        return np.concatenate([[0], np.cumsum(each + (np.arange(count) < more))])
+
+    def needed(size: int) -> list[int]:
+        first, end = starts(size)[:-1], starts(size)[1:]
+        return [*first[1:].tolist(), *((first + end - 1) // 2).tolist(), *((first + end) // 2).tolist()]
+
+    ((size, values, below),) = _at_ranks(portions, 1, needed)
+    borders, *middles = np.split(values, [count - 1, 2 * count - 1])
+    lower, equal = starts(size)[1:-1] - below[: count - 1], np.zeros(borders.size, np.int64)
+    bits = (borders + np.float32(0)).view(np.int32)  # as in `_key`; the sum turns -0 into 0
+    bins = ((bits ^ ((bits >> 31) & _LOWER_31)) >> _SHIFT) + _BINS // 2
+    in_lower_bins = np.searchsorted(bins, np.arange(_BINS))
+    parts = np.empty(size, np.uint8)
+    for n, end in enumerate(portions.ends):  # in order, because of equal numbers
+        numbers = portions.read(n)
+        _cut(numbers, borders, in_lower_bins, lower, equal, parts[end - numbers.size : end])
+    return parts, np.mean(middles, axis=0, dtype=np.float64)
 
 
 def _at_ranks(
-    values: Values, groups: Groups, ranks: Sequence[Sequence[int]]
-) -> list[tuple[Values, NDArray[np.int64]]]:
-    """For each group: the values that stand at these ranks (from 0) of its sorted values, and how many of its values
-    are smaller.
-    """
-    counts = np.zeros((len(ranks), _BINS), np.int64)
-    _count(values, groups, counts)
-    below = np.cumsum(counts, axis=1)
-    wanted = np.zeros(counts.shape, np.bool_)
-    bins = [
-        np.searchsorted(of_group, of_ranks, side="right")
-        for of_group, of_ranks in zip(below, ranks, strict=True)
-    ]
-    for group, of_group in enumerate(bins):
-        wanted[group, of_group] = True
-    sizes = np.where(wanted, counts, 0).sum(axis=1)
-    ends = np.cumsum(sizes)
-    chosen = np.empty(ends[-1], np.float32)
-    _collect(values, groups, wanted, ends - sizes, chosen)
-    found = []
-    for group, of_group in enumerate(bins):
-        ordered = chosen[ends[group] - sizes[group] : ends[group]]
-        ordered.sort()
-        left_out = np.cumsum(
-            np.where(wanted[group], 0, counts[group])
-        )  # values in lower bins that were not collected
-        of_ranks = ordered[np.asarray(ranks[group], np.intp) - left_out[of_group]]
-        found.append((of_ranks, np.searchsorted(ordered, of_ranks) + left_out[of_group]))
-    return found
-
-
-@compiled()
-def _bin(bits: int) -> int:
-    """The bin of a value with these bits. -0 has the bin of 0: equal values must have equal keys."""
-    bits = 0 if bits == _MINUS_ZERO else bits
-    return ((bits ^ ((bits >> 31) & 0x7FFFFFFF)) >> _SHIFT) + _BINS // 2
-
-
-@compiled()
-def _count(values: Values, groups: Groups, counts: NDArray[np.int64]) -> None:
-    """Add the number of values in each bin of each group to counts [group, bin]."""
-    bits = values.view(np.int32)
-    for n in range(bits.size):
-        counts[groups[n], _bin(bits[n])] += 1
-
-
-@compiled()
-def _collect(
-    values: Values, groups: Groups, wanted: NDArray[np.bool_], starts: NDArray[np.intp], chosen: Values
-) -> None:
-    """Copy the values in the wanted bins [group, bin].
+    portions: Portions, groups: int, ranks_of: Callable[[int], Sequence[int]]
+) -> list[tuple[int, Values, NDArray[np.int64]]]:
+    """For each group: its size, the values that stand at some ranks (from 0) of its sorted numbers, and how many of its
+    numbers are smaller.
 
     Parameters
     ----------
-    starts
-        The place of the first value of each group in `chosen`.
+    ranks_of
+        Function of the size of a group that returns the ranks.
     """
-    bits = values.view(np.int32)
-    place = starts.copy()
-    for n in range(bits.size):
-        if wanted[groups[n], _bin(bits[n])]:
-            chosen[place[groups[n]]] = values[n]
-            place[groups[n]] += 1
+
+    def by_upper_bits(share: range) -> Counts:
+        counts = np.zeros((groups, _BINS), np.int32)
+        for n in share:
+            _count_upper(*portions.portion(n), counts)
+        return counts
+
+    below = np.cumsum(
+        _sum(shared_out(by_upper_bits, len(portions.sizes), portions.threads)), axis=1, dtype=np.int64
+    )
+    ranks = [ranks_of(size) for size in below[:, -1].tolist()]
+    # Most bins contain no rank. The others are numbered.
+    bins = [np.searchsorted(*pair, side="right") for pair in zip(below, ranks, strict=True)]
+    wanted = np.zeros(below.shape, np.bool_)
+    for group, of_group in enumerate(bins):
+        wanted[group, of_group] = True
+    numbers = np.where(wanted, np.cumsum(wanted, dtype=np.int32).reshape(wanted.shape) - 1, -1).astype(
+        np.int16
+    )
+
+    def by_lower_bits(share: range) -> Counts:
+        counts = np.zeros((np.count_nonzero(wanted), _BINS), np.int32)
+        for n in share:
+            _count_lower(*portions.portion(n), numbers, counts)
+        return counts
+
+    within = np.cumsum(
+        _sum(shared_out(by_lower_bits, len(portions.sizes), portions.threads)), axis=1, dtype=np.int64
+    )
+    found = []
+    for group, (of_group, of_ranks) in enumerate(zip(bins, ranks, strict=True)):
+        values, smaller = np.empty(len(of_ranks), np.float32), np.empty(len(of_ranks), np.int64)
+        for n, (upper, rank) in enumerate(zip(of_group.tolist(), of_ranks, strict=True)):
+            in_lower_bins = below[group, upper - 1] if upper else 0
+            of_bin = within[numbers[group, upper]]
+            lower = int(np.searchsorted(of_bin, rank - in_lower_bins, side="right"))
+            smaller[n] = in_lower_bins + (of_bin[lower - 1] if lower else 0)
+            values[n] = _value(((upper - _BINS // 2) << _SHIFT) + lower)
+        found.append((int(below[group, -1]), values, smaller))
+    return found
+
+
+def _sum(of_shares: Sequence[Counts]) -> Counts:
+    return of_shares[0] if len(of_shares) == 1 else np.sum(of_shares, axis=0, dtype=np.int32)
+
+
+def _value(key: int) -> np.float32:
+    """The float32 that has this key."""
+    return np.int32(key if key >= 0 else key ^ _LOWER_31).view(np.float32)
 
 
 @compiled()
-def _cut(values: Values, borders: Values, lower: NDArray[np.int64], parts: Groups) -> None:
+def _key(bits: int) -> int:
+    """The key of a value with these bits. -0 has the key of 0: equal values must have equal keys."""
+    bits = 0 if bits == _MINUS_ZERO else bits
+    return bits ^ ((bits >> 31) & _LOWER_31)
+
+
+@compiled()
+def _count_upper(values: Values, groups: Groups, counts: Counts) -> None:
+    """Add the number of values in each bin of each group to counts [group, bin]."""
+    bits = values.view(np.int32)
+    for n in range(bits.size):
+        counts[groups[n], (_key(bits[n]) >> _SHIFT) + _BINS // 2] += 1
+
+
+@compiled()
+def _count_lower(values: Values, groups: Groups, numbers: NDArray[np.int16], counts: Counts) -> None:
+    """Add the number of values with each lower half of a key, in each wanted bin, to counts [number of the bin, half].
+
+    Parameters
+    ----------
+    numbers
+        The number of each bin [group, bin]; below 0: not wanted.
+    """
+    bits = values.view(np.int32)
+    for n in range(bits.size):
+        key = _key(bits[n])
+        number = numbers[groups[n], (key >> _SHIFT) + _BINS // 2]
+        if number >= 0:
+            counts[number, key & (_BINS - 1)] += 1
+
+
+@compiled()
+def _cut(
+    values: Values,
+    borders: Values,
+    in_lower_bins: NDArray[np.intp],
+    lower: NDArray[np.int64],
+    equal: NDArray[np.int64],
+    parts: Groups,
+) -> None:
     """Write the part of each value: the number of borders below it.
 
     Parameters
     ----------
+    in_lower_bins
+        For each bin, the number of borders in the bins below it.
     lower
         For each border, how many of the values that equal the border count as below it.
+    equal
+        For each border, how many values equalled it before; it is counted on.
     """
-    bits, equal = values.view(np.int32), np.zeros(borders.size, np.int64)
-    first = np.zeros(_BINS, np.uint8)  # the number of borders in lower bins
-    for bit in borders.view(np.int32):
-        for place in range(_bin(bit) + 1, _BINS):  # to add to a slice would compile two seconds longer
-            first[place] += 1
+    bits = values.view(np.int32)
     for n in range(values.size):
-        part = np.int64(first[_bin(bits[n])])
+        part = np.int64(in_lower_bins[(_key(bits[n]) >> _SHIFT) + _BINS // 2])
         while part < borders.size and borders[part] < values[n]:
             part += 1
         if part < borders.size and borders[part] == values[n]:

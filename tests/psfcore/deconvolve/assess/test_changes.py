@@ -21,7 +21,9 @@ from psfcore.deconvolve.assess.artefacts import (
     ringing_pct,
 )
 from psfcore.deconvolve.assess.changes import BLOCKS_PX, block_means, measure_changes
+from psfcore.deconvolve.assess.compared import Compared, SinglePlane
 from psfcore.deconvolve.assess.pictures import changes_png
+from psfcore.deconvolve.assess.ranks import Portions
 from psfcore.errors import DataError
 from psfcore.image import Image
 from psfcore.noise import Noise
@@ -31,6 +33,7 @@ from tests.psfcore.conftest import delta, make_image, make_psf
 from tests.psfcore.deconvolve.scattering import richardson_lucy, scattering_psf
 
 Plane = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 SIZE_PX, EDGE_PX = 384, 24
 HRI = "eui/derived_hrieuv174_20220401T103005920_pseudolinear.fits"
 
@@ -160,18 +163,23 @@ def test_the_suspected_pixels_are_those_of_a_slow_search() -> None:
     holes = (after < HOLE_SHARE * before) & (before > DETECTION_SIGMA * sigma)
     overshoots = after > (before + DETECTION_SIGMA * sigma) / peak_weight
     extremes = np.zeros(before.shape, bool)
-    noise_after = noise_levels(after, counted, classes_of(before[counted])).at(before)
+    pair = Compared(SinglePlane(before), SinglePlane(after), counted, threads=2)
+    noise_after = noise_levels(pair, pair.after, classes_of(Portions.of(before[counted]))).at(before)
     for sign, largest in ((1, maximum_filter), (-1, minimum_filter)):
         away = [sign * (plane - median_filter(plane, 5, mode="reflect")) for plane in (after, before)]
         peaks = after == largest(after, 3, mode="nearest")
         extremes |= peaks & (away[0] > EXTREME_SIGMA * noise_after) & (away[1] < sigma)
-    found = find_artefacts(
-        before, after, counted, peak_weight, sigma=lambda places: np.full(len(places[0]), sigma)
-    )
+    found = find_artefacts(pair, peak_weight, sigma=lambda places: np.full(len(places[0]), sigma))
     for name, flags in (("holes", holes), ("overshoots", overshoots), ("new_extremes", extremes)):
         share = np.count_nonzero(flags & counted) / np.count_nonzero(counted)
         assert share > 0 and found.signs[f"{name}_ppm"] == pytest.approx(1e6 * share), name
     np.testing.assert_array_equal(found.suspected, (holes | overshoots | extremes) & counted)
+
+
+def ringing(before: Plane, after: Plane, counted: Flags | None = None) -> tuple[float | None, int]:
+    """The ringing of an image, in percent, and the number of its sources."""
+    counted = np.ones(before.shape, bool) if counted is None else counted
+    return ringing_pct(Compared(SinglePlane(before), SinglePlane(after), counted))
 
 
 def test_rings_are_measured_in_percent_of_the_peak() -> None:
@@ -181,23 +189,23 @@ def test_rings_are_measured_in_percent_of_the_peak() -> None:
         r = np.hypot(y - centre, x - centre)
         before += 1000 * np.exp(-(r**2) / 8)
         after += 1500 * np.exp(-(r**2) / 2) + 150 * np.exp(-((r - 6) ** 2))
-    level, sources = ringing_pct(before, after, np.ones(before.shape, bool))
+    level, sources = ringing(before, after)
     assert sources == 3
     assert level == pytest.approx(10.0, abs=1.5)
-    assert ringing_pct(before, before, np.ones(before.shape, bool)) == (0.0, 3)
+    assert ringing(before, before) == (0.0, 3)
     for distance_px, count in ((9, 3), (8, 2)):  # a source must have 8 px without a bad one
         counted = np.ones(before.shape, bool)
         counted[100 - distance_px, 100] = False
-        assert ringing_pct(before, after, counted)[1] == count
-    assert ringing_pct(np.ones((64, 64)), np.ones((64, 64)), np.ones((64, 64), bool))[0] is None
+        assert ringing(before, after, counted)[1] == count
+    assert ringing(np.ones((64, 64)), np.ones((64, 64)))[0] is None
 
 
 def test_noise_is_estimated_from_the_pixels() -> None:
     expected = np.full((256, 256), 300.0) + np.linspace(0, 600, 256)
     noise = Noise(6.0, 2.0)
     pixels = noise.observe(expected, 1.4, np.random.default_rng(1))
-    counted, classes = np.ones(pixels.shape, bool), classes_of(expected.ravel())
-    levels = noise_levels(pixels, counted, classes)
+    classes, plane = classes_of(Portions.of(expected.ravel())), SinglePlane(pixels)
+    levels = noise_levels(Compared(plane, plane, np.ones(pixels.shape, bool)), plane, classes)
     ratio = levels.at(expected) / np.sqrt(noise.variance(expected, 1.4))
     assert np.abs(ratio - 1).max() < 0.1
     weights = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0])

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from psfcore.deconvolve.assess.ranks import medians, parts_of_equal_size, percentiles
+from psfcore.deconvolve.assess.ranks import Portions, medians, parts_of_equal_size, percentiles
 
 RNG = np.random.default_rng(3)
 VALUES = {
@@ -38,7 +40,9 @@ def test_parts_are_those_of_a_stable_sort(kind: str) -> None:
     sizes = [len(part) for part in np.array_split(values, 16)]
     expected = np.empty(values.size, int)
     expected[np.argsort(values, kind="stable")] = np.repeat(np.arange(16), sizes)
-    parts = parts_of_equal_size(values, 16)
+    portions = Portions.of(values)
+    parts, middles = parts_of_equal_size(portions, 16)
     np.testing.assert_array_equal(parts, expected)
     by_part = [np.median(values[expected == number].astype(float)) for number in range(16)]
-    np.testing.assert_allclose(medians(values, parts, 16), by_part, rtol=1e-6)
+    np.testing.assert_allclose(medians(replace(portions, groups=parts), 16), by_part, rtol=1e-6)
+    np.testing.assert_allclose(middles, by_part, rtol=1e-6)
