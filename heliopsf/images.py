@@ -179,7 +179,9 @@ def deconvolve(
             begin=begin,
             say=lambda code, message: warnings.warn(DataWarning(code, message), stacklevel=5),
         )
-        result = Deconvolution(**vars(product) | {"psf": Psf.of(product.psf)})
+        result = Deconvolution(
+            **vars(product) | {"psf": Psf.of(product.psf), "pixels": product.pixels.astype(np.float64)}
+        )
         return result if full else in_form_of(image if box is None else cut(image, box, given.hdu), result)
 
     if not is_many(smap):

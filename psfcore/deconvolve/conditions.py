@@ -99,7 +99,8 @@ class Deconvolved:
     Attributes
     ----------
     pixels
-        Estimate [y, x] in the image's unit; NaN where the image has no finite value.
+        Estimate [y, x] in the image's unit, float32 if this type can represent it; NaN where the image has no finite
+        value.
     stopped_because
         Reason why the iteration ended.
     flux_in
@@ -124,7 +125,7 @@ class Deconvolved:
         How the box was deconvolved, if the result is a box of an image; None for a whole image.
     """
 
-    pixels: NDArray[np.float64]
+    pixels: NDArray[np.floating]
     method: str
     steps_done: int
     stopped_because: str
@@ -145,7 +146,7 @@ class Deconvolved:
         return 100 * (self.flux_out - self.flux_in) / abs(self.flux_in) if self.flux_in else 0.0
 
 
-def fluxes(image: Image, pixels: NDArray[np.float64]) -> tuple[float, float, int]:
+def fluxes(image: Image, pixels: NDArray[np.floating]) -> tuple[float, float, int]:
     """`flux_in`, `flux_out` and `negative_pixels` of a `Deconvolved` with these pixels."""
     # The sums use no copies of planes: here most of the memory of a deconvolution is in use.
     counted = image.valid
@@ -153,7 +154,7 @@ def fluxes(image: Image, pixels: NDArray[np.float64]) -> tuple[float, float, int
     negative &= counted
     return (
         float(image.pixels.sum(where=counted)),
-        float(pixels.sum(where=counted)),
+        float(pixels.sum(where=counted, dtype=np.float64)),
         int(np.count_nonzero(negative)),
     )
 

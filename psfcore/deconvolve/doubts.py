@@ -112,8 +112,8 @@ def pixel_warnings(image: Image, psf_kernel: NDArray[np.float64]) -> dict[str, s
             f"at least {spikes} pixels are brighter than the PSF allows, as cosmic rays are, and spread: use the "
             "image after despiking, or mask them"
         )
-    sample = image.pixels[image.valid]
-    sample = sample[:: max(1, sample.size // _SAMPLE)]
+    step = max(1, image.pixels.size // _SAMPLE)
+    sample = image.pixels.ravel()[::step][image.mask.ravel()[::step] == 0]
     if sample.size:
         low, middle, high = np.percentile(sample, (0.1, 50, 99.9))
         count = parse_unit(image.unit).kind in ("count", "unknown")
@@ -169,7 +169,7 @@ def _brightest_of_blocks(image: Image) -> tuple[NDArray[np.intp], NDArray[np.int
         image.pixels if image.valid.all() else np.where(image.valid, image.pixels, np.nanmin(image.pixels))
     )
     blocks = plane[: ny * BLOCK_PX, : nx * BLOCK_PX].reshape(ny, BLOCK_PX, nx, BLOCK_PX)
-    brightest = blocks.max(axis=(1, 3))
+    brightest = blocks.max(axis=1).max(axis=-1)  # rows first, which are contiguous
     typical = np.median(blocks[:, BLOCK_PX // 2, :, ::4], axis=-1)
     chosen = np.argwhere(brightest - typical > SPIKE_SIGMA * _scatter(image))
     at = [int(blocks[by, :, bx, :].argmax()) for by, bx in chosen]

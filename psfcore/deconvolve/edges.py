@@ -40,6 +40,9 @@ EDGES: tuple[Edges, ...] = get_args(Edges)
 # If more than this share of a pixel's light may come from beyond the field, the pixel is flagged and left out of chi2.
 FLAGGED_SHARE = 0.05
 
+# The scales for which single precision represents a result: 1e18 times brighter and fainter than the brightest pixel.
+_IN_SINGLE = (1e-20, 1e20)
+
 Plane = NDArray[np.float32]
 Trust = NDArray[np.bool_]
 
@@ -94,8 +97,8 @@ class Domain:
         ny, nx = (part.stop - part.start for part in self.field)
         return ny + sought, nx + sought
 
-    def cut(self, blocks: Iterable[tuple[int, Plane]]) -> NDArray[np.float64]:
-        """Cut the field out of a plane, in the image's unit.
+    def cut(self, blocks: Iterable[tuple[int, Plane]]) -> NDArray[np.floating]:
+        """Cut the field out of a plane, in the image's unit: in single precision, if it can represent the image.
 
         Parameters
         ----------
@@ -103,12 +106,16 @@ class Domain:
             Pairs of the number of the first row and the rows of the plane that begin there.
         """
         rows, columns = self.field
-        pixels = np.empty((rows.stop - rows.start, columns.stop - columns.start))
+        low, high = _IN_SINGLE
+        single = low <= self.scale <= high
+        pixels = np.empty(
+            (rows.stop - rows.start, columns.stop - columns.start), np.float32 if single else np.float64
+        )
         for first, block in blocks:
             part = block[max(rows.start - first, 0) : max(rows.stop - first, 0), columns]
             start = max(first - rows.start, 0)
-            pixels[start : start + len(part)] = part
-        pixels *= self.scale
+            here = pixels[start : start + len(part)]
+            np.multiply(part, self.scale, out=here, dtype=np.float64, casting="same_kind")
         return pixels
 
 

@@ -139,7 +139,7 @@ def convolve(image: Image, psf: Psf, *, edges: KnownScene = "zero", threads: int
     engine = Engine(psf.kernel, domain.shape, span=domain.shape, threads=threads)
     pixels = domain.cut([(0, engine.apply(domain.pixels))])
     pixels[~image.finite] = np.nan
-    return pixels
+    return pixels.astype(np.float64)
 
 
 def convolve_image(

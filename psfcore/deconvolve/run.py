@@ -17,8 +17,7 @@ from astropy.io.fits import Header
 from numpy.typing import NDArray
 
 from psfcore import software_version
-from psfcore.deconvolve.assess.changes import MEANINGS
-from psfcore.deconvolve.assess.ranks import percentiles
+from psfcore.deconvolve.assess.changes import MEANINGS, bright_and_dark_change_pct
 from psfcore.deconvolve.conditions import Deconvolved, PreparedPsfs, Progress
 from psfcore.deconvolve.declaration import check_stop
 from psfcore.deconvolve.doubts import input_warnings
@@ -167,9 +166,9 @@ class Product(Deconvolved):
             percentile of the input; a dark pixel is at or below the first percentile.
         """
         image, box, saturation = self.image, self.of_box, self.image.saturation
-        before, after = (plane[image.valid].astype(np.float32) for plane in (image.pixels, self.pixels))
-        low, high = percentiles(before, [1, 99])
-        dark, bright = before <= low, before >= high
+        bright_change_pct, dark_change_pct = bright_and_dark_change_pct(
+            image, self.pixels, threads=self.work.options.threads
+        )
         psf = used or self.psf
         origin = (psf.name, self.psf.instrument, provenance or self.psf.provenance)
         return {
@@ -198,8 +197,8 @@ class Product(Deconvolved):
                 "error_pct": box.error_pct,
             },
             "flux_change_pct": self.flux_change_pct,
-            "bright_change_pct": _change_pct(before[bright], after[bright]),
-            "dark_change_pct": _change_pct(before[dark], after[dark]),
+            "bright_change_pct": bright_change_pct,
+            "dark_change_pct": dark_change_pct,
             "negative_pixels": self.negative_pixels,
             "masked_pixels": {
                 str(bit.name).lower(): int(np.count_nonzero(image.mask & bit.value)) for bit in MaskBit
@@ -429,7 +428,8 @@ def write(product: Product, path: Path, psf: UsedPsf, ids: Identities) -> None:
             cards["INPSHA"] = (ids.input_sha256, "")
     write_image(
         path,
-        replace(product.image, pixels=product.pixels, header=own.header),
+        replace(product.image, header=own.header),
+        pixels=product.pixels,
         cards=own.cards | cards,
         history=deconvolution_history(product, psf) + own.history,
         planes=product.planes,
@@ -516,9 +516,3 @@ def deconvolution_history(product: Product, psf: UsedPsf) -> list[str]:
         *([] if product.noise is None or product.noise.source == "given" else [f"noise: {product.noise}"]),
         *(f"WARNING ({code}): {message}" for code, message in product.warnings.items()),
     ]
-
-
-def _change_pct(before: NDArray[np.float32], after: NDArray[np.float32]) -> float | None:
-    """Change of the summed intensity, in percent; None if the sum of the input is not positive."""
-    total = float(before.sum(dtype=np.float64))
-    return 100 * (float(after.sum(dtype=np.float64)) / total - 1) if total > 0 else None

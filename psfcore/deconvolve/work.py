@@ -182,9 +182,9 @@ class Work:
         planes = error_planes(
             self.image,
             self.psf,
-            lambda image: self.run(image).pixels,
+            lambda image: self.run(image).pixels.astype(np.float64, copy=False),
             replace(self.options, progress=told),
-            estimate=result.pixels,
+            estimate=result.pixels.astype(np.float64, copy=False),
             draws=self.options.error_draws,
             edge_px=result.edge_band_px,
         )
@@ -192,7 +192,9 @@ class Work:
         if not psfs:
             return planes
         spread = spread_of_results(
-            psfs, lambda psf: self.run(psf=psf).pixels, progress=begin("errors of the PSF", len(psfs))
+            psfs,
+            lambda psf: self.run(psf=psf).pixels.astype(np.float64, copy=False),
+            progress=begin("errors of the PSF", len(psfs)),
         )
         return replace(planes, psf_error=np.where(np.isnan(planes.error), np.nan, spread))
 
@@ -256,6 +258,11 @@ class BoxWork:
     mean: float
 
     @property
+    def options(self) -> Options:
+        """The options of the deconvolution of box and rim."""
+        return self.work.options
+
+    @property
     def rim_px(self) -> int:
         """Largest width of the rim, px."""
         box, rim = self.box, self.rim
@@ -285,7 +292,7 @@ class BoxWork:
             self.work.psf,
             noise=self.noise,
             edge_px=self._counted_edge_px(result.edge_band_px),
-            threads=self.work.options.threads,
+            threads=self.options.threads,
         )
         quality = self.of_mask.copy()
         quality[near_edge] |= np.uint8(QualityBit.EDGE)

@@ -134,6 +134,7 @@ def write_image(
     path: str | Path,
     image: Image,
     *,
+    pixels: NDArray[np.floating] | None = None,
     cards: Cards,
     history: Sequence[str] = (),
     planes: Mapping[str, NDArray[Any]] | None = None,
@@ -149,20 +150,22 @@ def write_image(
 
     Parameters
     ----------
+    pixels
+        The pixels [y, x] of the product; None: those of the image.
     planes
         Planes [y, x] by name (QUALITY, ERROR, PSF_ERROR), see above.
     plane_bits
         The meaning of the bits of each plane of bits.
     """
     header = _kept_header(image.header)
-    pixels = image.pixels.astype(np.float32)
-    finite = pixels[np.isfinite(pixels)]
-    if finite.size:
+    pixels = (image.pixels if pixels is None else pixels).astype(np.float32, copy=False)
+    finite = np.isfinite(pixels)
+    if finite.any():
         header.update(
             {
-                "DATAMIN": (float(finite.min()), "smallest finite pixel"),
-                "DATAMAX": (float(finite.max()), "largest finite pixel"),
-                "DATAMEAN": (float(finite.mean(dtype=np.float64)), "mean of finite pixels"),
+                "DATAMIN": (float(pixels.min(where=finite, initial=np.inf)), "smallest finite pixel"),
+                "DATAMAX": (float(pixels.max(where=finite, initial=-np.inf)), "largest finite pixel"),
+                "DATAMEAN": (float(pixels.mean(where=finite, dtype=np.float64)), "mean of finite pixels"),
             }
         )
     header.update(_ascii(cards))

@@ -45,7 +45,7 @@ TAILS_PCT = (5.0, 1.0, 0.1)
 CHANGE_PERCENTILES = (0.1, 1.0, 5.0, 25.0, 50.0, 75.0, 95.0, 99.0, 99.9)
 _LARGEST_PCT = 99.0
 
-Plane = NDArray[np.float64]
+Plane = NDArray[np.floating]
 Means = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 Pixel = TypeVar("Pixel", bound=np.generic)
@@ -192,6 +192,39 @@ def measure_changes(
         ranges=tuple(row for part in blocks for row in _ranges(part)),
         artefacts=find_artefacts(pair, float(psf.kernel[centre]), sigma=sigma),
     )
+
+
+def bright_and_dark_change_pct(
+    image: Image, result: Plane, *, threads: int = 1
+) -> tuple[float | None, float | None]:
+    """The change of the light of the brightest and of the darkest percent of the trusted pixels, in percent.
+
+    A change is None if the light before is not above zero.
+
+    Parameters
+    ----------
+    result
+        The deconvolved image [y, x].
+    threads
+        Number of threads; it does not change the result.
+    """
+    pair = Compared(SinglePlane(image.pixels), SinglePlane(result), image.valid, threads)
+    low, high = ranks.percentiles(pair.portions(pair.before.__getitem__), [1, 99])
+
+    def share(numbers: range) -> NDArray[np.float64]:
+        light = np.zeros((2, 2))
+        for n in numbers:
+            old, new = (
+                chosen(plane[pair.blocks[n]], pair.counted[pair.blocks[n]]).astype(np.float64)
+                for plane in (pair.before, pair.after)
+            )
+            for tail, flags in enumerate((old >= high, old <= low)):
+                light[tail] += old[flags].sum(), new[flags].sum()
+        return light
+
+    light = np.sum(shared_out(share, len(pair.blocks), threads), axis=0).tolist()
+    bright, dark = (100 * (after / before - 1) if before > 0 else None for before, after in light)
+    return bright, dark
 
 
 def _noise_at(image: Image, noise: Noise) -> NoiseAt:
@@ -483,7 +516,7 @@ def quality_plane(
         (MaskBit.SATURATED, QualityBit.SATURATED),
         (MaskBit.LOST, QualityBit.LOST),
     ):
-        plane[(image.mask & mask_bit) != 0] |= np.uint8(bit)
+        plane[(image.mask & mask_bit.value) != 0] |= np.uint8(bit)
     if not image.valid.all():
         plane[image.valid & _near(~image.valid, NEAR_MASKED_PX)] |= np.uint8(QualityBit.NEAR_MASKED)
     plane[~inside_band(result.shape, edge_px)] |= np.uint8(QualityBit.EDGE)

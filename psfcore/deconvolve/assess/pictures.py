@@ -47,7 +47,7 @@ _HISTOGRAM_BLOCK_PX = 4
 _RATIO_MARKS = (0.1, 0.2, 0.3, 0.5, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.5, 2.0, 3.0, 5.0, 10.0)
 _BEFORE, _AFTER = "#1f6fb4", "#d5642f"
 
-Plane = NDArray[np.float64]
+Plane = NDArray[np.floating]
 THUMBNAIL_PX = 256
 MOST_ON_SHEET = 60
 DATE_KEYS = ("DATE-BEG", "DATE-OBS", "T_OBS")

@@ -192,7 +192,7 @@ def test_the_error_of_the_psf_is_the_spread_of_its_results(psf: Psf) -> None:
     options = Options(method="linear", error_draws=2, noise=NOISE, parameters={"steps": 2})
     work = Work(make_image(pixels), psfs[-1], options)
     planes = work.errors(work.run(), possible_psfs=lambda: psfs)
-    stack = [work.run(psf=one).pixels for one in psfs]
+    stack = [work.run(psf=one).pixels.astype(float) for one in psfs]
     np.testing.assert_allclose(planes.psf_error, np.std(stack, axis=0), rtol=1e-9)
     np.testing.assert_array_equal(np.isnan(planes.psf_error), np.isnan(pixels))
     assert work.errors(work.run()).psf_error is None
