@@ -302,25 +302,30 @@ class Engine:
         """
         ly, lx = self.column_plan.length, self.row_plan.length
         blocks = -(-ly // BLOCK_ROWS)
-        transfer = np.zeros((self.column_blocks, blocks * BLOCK_ROWS, 2, LANES), np.float32)
+        whole = np.zeros((self.column_blocks, blocks * BLOCK_ROWS, 2, LANES), np.float32)
+        real = aligned(self.column_blocks, ly, 1, LANES)
 
         def along_rows(start: int, stop: int, scratch: Scratch) -> None:
             for block in range(start, stop):
                 here = slice(block * BLOCK_ROWS, (block + 1) * BLOCK_ROWS)
                 rows = _wrapped_rows(kernel, first, (ly, lx), here) * np.float32(1 / self.transfer_scale)
                 lanes = np.ascontiguousarray(rows.reshape(1, 2, LANES, lx).transpose(0, 3, 1, 2))
-                _rows_forward(Lines(transfer, *scratch, self.row_plan), 0, 1, lanes, block)
+                _rows_forward(Lines(whole, *scratch, self.row_plan), 0, 1, lanes, block)
 
-        def along_columns(start: int, stop: int, _scratch: Scratch) -> None:
+        def along_columns(start: int, stop: int, _scratch: Scratch) -> float:
+            odd_part = 0.0
             for block in range(start, stop):
-                forward(transfer[block, :ly].reshape(-1), self.column_plan)
+                column = whole[block, :ly]
+                forward(column.reshape(-1), self.column_plan)
+                # While the column is in the cache: its real part may be all that is needed.
+                real[block] = column[:, :1]
+                odd_part = max(odd_part, float(column[:, 1].max()), -float(column[:, 1].min()))
+            return odd_part
 
         self.run(along_rows, blocks)
-        self.run(along_columns, self.column_blocks)
-        transfer = transfer[:, :ly]
-        odd_part = float(np.abs(transfer[:, :, 1]).max()) * self.transfer_scale
+        odd_part = max(self.run(along_columns, self.column_blocks)) * self.transfer_scale
         symmetric = odd_part < SYMMETRIC_TO * float(np.abs(kernel).sum())
-        return _aligned_copy(transfer[:, :, :1] if symmetric else transfer)
+        return real if symmetric else _aligned_copy(whole[:, :ly])
 
 
 def aligned(*shape: int) -> Single:

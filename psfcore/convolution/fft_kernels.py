@@ -49,6 +49,8 @@ from psfcore.convolution.lanes import (
 _HALF = np.float32(0.5)
 _HALF_ROOT = np.float32(np.sqrt(0.5))
 _HALF_ROOT_3 = np.float32(np.sqrt(0.75))
+_COS_FIFTH, _COS_TWO_FIFTHS = (np.float32(np.cos(2 * np.pi * q / 5)) for q in (1, 2))
+_SIN_FIFTH, _SIN_TWO_FIFTHS = (np.float32(np.sin(2 * np.pi * q / 5)) for q in (1, 2))
 
 # A pass gets the buffer, its twiddle factors, the length of the transform, and the length of its own blocks.
 _PASS = types.void(types.CPointer(types.float32), types.CPointer(types.float32), types.int64, types.int64)
@@ -109,11 +111,12 @@ def make_plan(length: int) -> Plan:
 
 
 def _radices(length: int) -> list[int]:
-    """Radices of the passes: first 3 (up to twice), then 4 or 2 if needed, then 8."""
+    """Radices of the passes: first 5 or 3 (3 up to twice), then 4 or 2 if needed, then 8."""
     radices, rest = [], length
-    while rest % 3 == 0:
-        radices.append(3)
-        rest //= 3
+    for odd in (5, 3):
+        while rest % odd == 0:
+            radices.append(odd)
+            rest //= odd
     eights = 0
     while rest % 8 == 0:
         eights += 1
@@ -121,7 +124,7 @@ def _radices(length: int) -> list[int]:
     if rest > 1:
         radices.append(rest)
     if rest not in (1, 2, 4):
-        raise ValueError(f"expected a length 2^a, 3 2^a or 9 2^a; got {length}")
+        raise ValueError(f"expected a length 2^a, 3 2^a, 5 2^a or 9 2^a; got {length}")
     return radices + [8] * eights
 
 
@@ -163,6 +166,27 @@ def _dft4(a: Leg, b: Leg, c: Leg, d: Leg) -> list[Leg]:
     return [(sr + ur, si + ui), (tr + vi, ti - vr), (sr - ur, si - ui), (tr - vi, ti + vr)]
 
 
+def _dft5(a: Leg, b: Leg, c: Leg, d: Leg, e: Leg) -> list[Leg]:
+    (pr, pi), (ur, ui) = _dft2(b, e)
+    (qr, qi), (vr, vi) = _dft2(c, d)
+
+    def even(near: np.float32, far: np.float32) -> Leg:
+        real, imaginary = (
+            p.times_plus(p.like(near), q.times_plus(q.like(far), centre))
+            for p, q, centre in ((pr, qr, a[0]), (pi, qi, a[1]))
+        )
+        return real, imaginary
+
+    def odd(first: np.float32, second: np.float32) -> Leg:
+        real, imaginary = (u.times_plus(u.like(first), second * v) for u, v in ((ur, vr), (ui, vi)))
+        return real, imaginary
+
+    (er, ei), (fr, fi) = even(_COS_FIFTH, _COS_TWO_FIFTHS), even(_COS_TWO_FIFTHS, _COS_FIFTH)
+    (gr, gi), (hr, hi) = odd(_SIN_FIFTH, _SIN_TWO_FIFTHS), odd(_SIN_TWO_FIFTHS, -_SIN_FIFTH)
+    outer = [(er + gi, ei - gr), (fr + hi, fi - hr), (fr - hi, fi + hr), (er - gi, ei + gr)]
+    return [(a[0] + pr + qr, a[1] + pi + qi), *outer]
+
+
 def _dft8(*legs: Leg) -> list[Leg]:
     sums, differences = zip(*(_dft2(legs[q], legs[q + 4]) for q in range(4)), strict=True)
     even = _dft4(*sums)
@@ -176,7 +200,7 @@ def _dft8(*legs: Leg) -> list[Leg]:
 # Which of two products is rounded with their sum makes no difference for the accuracy. For these legs of a forward pass
 # it is the other one, because results must be those of earlier versions, bit for bit.
 _ROUNDED_LAST = {4: (1, 3), 8: (2, 6)}
-_DFT: dict[int, Callable[..., list[Leg]]] = {2: _dft2, 3: _dft3, 4: _dft4, 8: _dft8}
+_DFT: dict[int, Callable[..., list[Leg]]] = {2: _dft2, 3: _dft3, 4: _dft4, 5: _dft5, 8: _dft8}
 
 
 @instruction_of_constants

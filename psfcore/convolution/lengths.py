@@ -5,11 +5,11 @@ too.
 from __future__ import annotations
 
 LARGEST_LENGTH = 16384
-_ODD_FACTORS = (1, 3, 9)
+_ODD_FACTORS = (1, 3, 5, 9)
 
 
 def good_length(at_least: int) -> int:
-    """The smallest supported length >= `at_least`. Supported are 2^a, 3 2^a and 9 2^a with a >= 4. Raises
+    """The smallest supported length >= `at_least`. Supported are 2^a, 3 2^a, 5 2^a and 9 2^a with a >= 4. Raises
     ValueError.
     """
     candidates = [odd << a for odd in _ODD_FACTORS for a in range(4, 15) if odd << a <= LARGEST_LENGTH]

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import get_args
+from typing import TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,7 @@ _IN_SINGLE = (1e-20, 1e20)
 
 Plane = NDArray[np.float32]
 Trust = NDArray[np.bool_]
+Number = TypeVar("Number", bound=np.generic)
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,22 +194,28 @@ def lay_out(image: Image, *, edges: Edges, margin_px: int) -> Domain:
             "no-signal", "expected at least one pixel other than zero; all are zero: use another image"
         )
     # Divide in float64: float32 cannot hold numbers such as 1e-300 and 1e300.
-    scaled = np.where(finite, image.pixels, 0.0)
-    scaled /= scale
+    scaled = np.empty(image.pixels.shape, np.float32)
+    np.divide(image.pixels, scale, out=scaled, dtype=np.float64, casting="same_kind")
+    np.copyto(scaled, 0, where=~finite)
     margin = 0 if edges == "zero" else margin_px
-    ny, nx = scaled.shape
-    trusted = np.pad(image.valid, margin, mode="symmetric")
+    ny, nx = image.pixels.shape
+    trusted = _continued(image.valid, margin)
     field = (slice(margin, margin + ny), slice(margin, margin + nx))
     if edges == "extended":
         observed = np.zeros_like(trusted)
         observed[field] = True
         trusted &= observed
     return Domain(
-        pixels=np.pad(scaled.astype(np.float32), margin, mode="symmetric"),
+        pixels=_continued(scaled, margin),
         trusted=trusted,
-        finite=np.pad(finite, margin, mode="symmetric"),
+        finite=_continued(finite, margin),
         field=field,
         scale=scale,
         edges=edges,
         margin_px=margin,
     )
+
+
+def _continued(plane: NDArray[Number], margin_px: int) -> NDArray[Number]:
+    """The plane [y, x] with its mirror image in a margin."""
+    return np.pad(plane, margin_px, mode="symmetric") if margin_px else plane

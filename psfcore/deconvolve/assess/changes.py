@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from psfcore.deconvolve.assess import ranks
 from psfcore.deconvolve.assess.artefacts import Artefacts, NoiseAt, find_artefacts
-from psfcore.deconvolve.assess.compared import Compared, SinglePlane, chosen
+from psfcore.deconvolve.assess.compared import Compared, single
 from psfcore.deconvolve.edges import inside_band
 from psfcore.errors import DataError
 from psfcore.fits.units import dn_per_unit
@@ -169,7 +169,7 @@ def measure_changes(
         )
     sigma = None if noise is None else _noise_at(image, noise)
     centre = (psf.kernel.shape[0] // 2, psf.kernel.shape[1] // 2)
-    pair = Compared(SinglePlane(image.pixels), SinglePlane(result), counted, threads)
+    pair = Compared(single(image.pixels), single(result), counted, threads)
     above = replace(pair, counted=counted & (image.pixels > 0))
     blocks = [_pixels(pair), *_larger_blocks(image.pixels, result, pair)]
     light_before, light_after = (
@@ -208,14 +208,14 @@ def bright_and_dark_change_pct(
     threads
         Number of threads; it does not change the result.
     """
-    pair = Compared(SinglePlane(image.pixels), SinglePlane(result), image.valid, threads)
+    pair = Compared(single(image.pixels), single(result), image.valid, threads)
     low, high = ranks.percentiles(pair.portions(pair.before.__getitem__), [1, 99])
 
     def share(numbers: range) -> NDArray[np.float64]:
         light = np.zeros((2, 2))
         for n in numbers:
             old, new = (
-                chosen(plane[pair.blocks[n]], pair.counted[pair.blocks[n]]).astype(np.float64)
+                pair.compared(plane[pair.blocks[n]], n).astype(np.float64)
                 for plane in (pair.before, pair.after)
             )
             for tail, flags in enumerate((old >= high, old <= low)):
@@ -335,7 +335,7 @@ def _means_of_rows(before: Plane, after: Plane, pair: Compared, rows: slice) -> 
             old, new = _joined(old, np.add), _joined(new, np.add)
         counted, block_px = _joined(counted, np.logical_and), 2 * block_px
         if block_px in BLOCKS_PX:
-            means = [chosen(plane, counted) / block_px**2 for plane in (old, new)]
+            means = [plane[counted] / block_px**2 for plane in (old, new)]
             found.append(np.array(means, dtype=np.float32))
     return found
 

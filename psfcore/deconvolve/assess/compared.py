@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,27 +15,9 @@ from psfcore.deconvolve.assess import ranks
 _BLOCK_ROWS = 64
 Plane = NDArray[np.floating]
 Flags = NDArray[np.bool_]
+Single = NDArray[np.float32]
 Places = tuple[NDArray[np.intp], ...]
 Number = TypeVar("Number", bound=np.generic)
-Pixels = TypeVar("Pixels", NDArray[np.floating], NDArray[np.bool_])
-
-
-class SinglePlane:
-    """A plane [y, x] that is read in single precision, rows or positions at a time, and is never copied as a whole.
-
-    Pixels that are not finite have the median of the finite ones.
-    """
-
-    def __init__(self, plane: Plane) -> None:
-        middle = _middle(plane)
-        self._plane, self._fill = plane, None if middle is None else np.float32(middle)
-
-    def __len__(self) -> int:
-        return len(self._plane)
-
-    def __getitem__(self, at: slice | Places) -> NDArray[np.float32]:
-        part = self._plane[at].astype(np.float32, copy=False)
-        return part if self._fill is None else np.where(np.isfinite(part), part, self._fill)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,12 +26,14 @@ class Compared:
 
     Attributes
     ----------
+    before, after
+        The planes [y, x] in single precision, which is accurate enough, see `single`.
     counted
         The compared pixels [y, x].
     """
 
-    before: SinglePlane
-    after: SinglePlane
+    before: Single
+    after: Single
     counted: Flags
     threads: int = 1
 
@@ -63,6 +47,23 @@ class Compared:
         """The number of compared pixels in each block."""
         return np.array([np.count_nonzero(self.counted[rows]) for rows in self.blocks])
 
+    @cached_property
+    def _columns(self) -> list[slice | None]:
+        """The columns of each block whose pixels are all compared, if no others are; None: others are."""
+        found: list[slice | None] = []
+        for rows, size in zip(self.blocks, self.sizes, strict=True):
+            flags = self.counted[rows]
+            columns = np.flatnonzero(flags[0])
+            inner = slice(columns[0], columns[-1] + 1) if columns.size else slice(0, 0)
+            whole = size == flags[:, inner].size and flags[:, inner].all()
+            found.append(inner if whole else None)
+        return found
+
+    def compared(self, plane: NDArray[Number], n: int) -> NDArray[Number]:
+        """The compared pixels (k,) of block n, of its rows [y, x] of a plane."""
+        columns = self._columns[n]
+        return plane[self.counted[self.blocks[n]]] if columns is None else plane[:, columns].ravel()
+
     def portions(self, of: Callable[[slice], Plane], groups: ranks.Groups | None = None) -> ranks.Portions:
         """Numbers of the compared pixels, for `ranks`.
 
@@ -75,14 +76,15 @@ class Compared:
         """
 
         def read(n: int) -> ranks.Values:
-            return chosen(of(self.blocks[n]), self.counted[self.blocks[n]]).astype(np.float32, copy=False)
+            return self.compared(of(self.blocks[n]), n).astype(np.float32, copy=False)
 
         return ranks.Portions(self.sizes, read, groups, self.threads)
 
 
-def chosen(block: NDArray[Number], flags: Flags) -> NDArray[Number]:
-    """The pixels (n,) of a block [y, x] that have a flag."""
-    return block.ravel() if flags.all() else block[flags]
+def single(plane: Plane) -> Single:
+    """The plane in single precision; pixels that are not finite have the median of the finite ones."""
+    middle, single = _middle(plane), plane.astype(np.float32, copy=False)
+    return single if middle is None else np.where(np.isfinite(single), single, np.float32(middle))
 
 
 def row_blocks(count: int) -> Iterator[slice]:
@@ -91,19 +93,19 @@ def row_blocks(count: int) -> Iterator[slice]:
         yield slice(top, min(top + _BLOCK_ROWS, count))
 
 
-def with_rim(
-    plane: Pixels | SinglePlane, rows: slice, rim_px: int, rim: Literal["edge", "symmetric"]
-) -> Pixels:
-    """Some rows of a plane with a rim on all sides.
-
-    Parameters
-    ----------
-    rim
-        How the rim is filled beyond the edges, as a mode of `numpy.pad`.
-    """
-    first, last = max(rows.start - rim_px, 0), min(rows.stop + rim_px, len(plane))
-    missing = (rim_px - (rows.start - first), rim_px - (last - rows.stop))
-    return np.pad(plane[first:last], (missing, (rim_px, rim_px)), mode=rim)
+def with_rim(plane: NDArray[Number], rows: slice, rim_px: int) -> NDArray[Number]:
+    """Some rows of a plane [y, x] with a rim on all sides; beyond the edges, it is the mirror image of the plane."""
+    ny, nx = plane.shape
+    first, last = max(rows.start - rim_px, 0), min(rows.stop + rim_px, ny)
+    low, high = rim_px - (rows.start - first), rim_px - (last - rows.stop)
+    if high or low or rim_px > nx:
+        return np.pad(plane[first:last], ((low, high), (rim_px, rim_px)), mode="symmetric")
+    # The same as `numpy.pad`, in half of the time.
+    block = np.empty((last - first, nx + 2 * rim_px), plane.dtype)
+    block[:, rim_px:-rim_px] = plane[first:last]
+    block[:, :rim_px] = block[:, 2 * rim_px - 1 : rim_px - 1 : -1]
+    block[:, -rim_px:] = block[:, -rim_px - 1 : -2 * rim_px - 1 : -1]
+    return block
 
 
 def filled(plane: Plane) -> Plane:

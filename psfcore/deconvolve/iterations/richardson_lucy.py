@@ -113,7 +113,7 @@ def light_above_floor(problem: Problem) -> Single:
     Raises DataError "no-signal" if no trusted pixel is above zero.
     """
     domain = problem.domain
-    if not (domain.pixels[domain.trusted] > 0).any():
+    if not np.any(domain.pixels > 0, where=domain.trusted):
         raise DataError(
             "no-signal",
             "expected at least one trusted pixel above zero; got none: use another image or the method linear",

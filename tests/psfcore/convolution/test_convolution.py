@@ -66,11 +66,33 @@ def test_another_shape_is_refused() -> None:
         Engine(np.ones((3, 3)) / 9, (20, 20)).apply(np.ones((20, 21)))
 
 
-LENGTHS = [16, 32, 48, 64, 96, 128, 144, 192, 256, 288, 384, 512, 576, 768, 1024, 1152, 2048, 3072, 4096]
+LENGTHS = [
+    16,
+    32,
+    48,
+    64,
+    80,
+    96,
+    128,
+    144,
+    160,
+    192,
+    256,
+    288,
+    384,
+    512,
+    576,
+    768,
+    1024,
+    1152,
+    2048,
+    3072,
+    4096,
+]
 
 
 def test_transforms_agree_with_numpy_and_are_inverted() -> None:
-    for length in (*LENGTHS, 8192, 16384):
+    for length in (*LENGTHS, 5120, 8192, 16384):
         rng = np.random.default_rng(length)
         signals = rng.standard_normal((length, 2, LANES)).astype(np.float32)
         expected = np.fft.fft(signals[:, 0] + 1j * signals[:, 1], axis=0)
@@ -85,8 +107,8 @@ def test_transforms_agree_with_numpy_and_are_inverted() -> None:
 
 def test_lengths_are_the_smallest_that_fit() -> None:
     assert Convolver(delta(2048), (2048, 2048)).length == (3072, 3072)  # shorter than twice the edge
-    assert [good_length(n) for n in (1, 16, 17, 2049, 3072, 3073, 4097, 4609)] == [
-        16, 16, 32, 2304, 3072, 4096, 4608, 6144,
+    assert [good_length(n) for n in (1, 16, 17, 65, 2049, 3072, 3073, 4097, 4609, 5121)] == [
+        16, 16, 32, 80, 2304, 3072, 4096, 4608, 5120, 6144,
     ]  # fmt: skip
     with pytest.raises(ValueError, match="at most"):
         good_length(20_000)

@@ -21,7 +21,7 @@ from psfcore.deconvolve.assess.artefacts import (
     ringing_pct,
 )
 from psfcore.deconvolve.assess.changes import BLOCKS_PX, block_means, measure_changes
-from psfcore.deconvolve.assess.compared import Compared, SinglePlane
+from psfcore.deconvolve.assess.compared import Compared, single
 from psfcore.deconvolve.assess.pictures import changes_png
 from psfcore.deconvolve.assess.ranks import Portions
 from psfcore.errors import DataError
@@ -163,7 +163,7 @@ def test_the_suspected_pixels_are_those_of_a_slow_search() -> None:
     holes = (after < HOLE_SHARE * before) & (before > DETECTION_SIGMA * sigma)
     overshoots = after > (before + DETECTION_SIGMA * sigma) / peak_weight
     extremes = np.zeros(before.shape, bool)
-    pair = Compared(SinglePlane(before), SinglePlane(after), counted, threads=2)
+    pair = Compared(single(before), single(after), counted, threads=2)
     noise_after = noise_levels(pair, pair.after, classes_of(Portions.of(before[counted]))).at(before)
     for sign, largest in ((1, maximum_filter), (-1, minimum_filter)):
         away = [sign * (plane - median_filter(plane, 5, mode="reflect")) for plane in (after, before)]
@@ -179,7 +179,7 @@ def test_the_suspected_pixels_are_those_of_a_slow_search() -> None:
 def ringing(before: Plane, after: Plane, counted: Flags | None = None) -> tuple[float | None, int]:
     """The ringing of an image, in percent, and the number of its sources."""
     counted = np.ones(before.shape, bool) if counted is None else counted
-    return ringing_pct(Compared(SinglePlane(before), SinglePlane(after), counted))
+    return ringing_pct(Compared(single(before), single(after), counted))
 
 
 def test_rings_are_measured_in_percent_of_the_peak() -> None:
@@ -204,7 +204,7 @@ def test_noise_is_estimated_from_the_pixels() -> None:
     expected = np.full((256, 256), 300.0) + np.linspace(0, 600, 256)
     noise = Noise(6.0, 2.0)
     pixels = noise.observe(expected, 1.4, np.random.default_rng(1))
-    classes, plane = classes_of(Portions.of(expected.ravel())), SinglePlane(pixels)
+    classes, plane = classes_of(Portions.of(expected.ravel())), single(pixels)
     levels = noise_levels(Compared(plane, plane, np.ones(pixels.shape, bool)), plane, classes)
     ratio = levels.at(expected) / np.sqrt(noise.variance(expected, 1.4))
     assert np.abs(ratio - 1).max() < 0.1
