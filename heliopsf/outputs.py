@@ -95,7 +95,7 @@ class Deconvolution(_BeforeAndAfter, Product):
         Sum of the same pixels of the result.
     negative_pixels : int
         Number of valid pixels below 0 in the image.
-    edges : {"zero", "symmetric", "extended"}
+    edges : {"zero", "symmetric", "extended", "periodic"}
         Assumption about the scene beyond the field of view.
     margin_px : int
         Width of the margin in which the scene was also estimated, px.

@@ -65,7 +65,7 @@ class Options:
     error_draws : int
         Number of noise realisations (2 to 64) for the standard deviation of each pixel, the ``uncertainty`` of the
         result; 8 is a good number. Each takes as long as a deconvolution. 0: no uncertainty.
-    edges : {"zero", "symmetric", "extended"}, optional
+    edges : {"zero", "symmetric", "extended", "periodic"}, optional
         The scene beyond the field of view. Default: the assumption that suits the method best.
     margin_px : int, optional
         Width of the margin around the field of view in which the scene is also estimated.

@@ -34,11 +34,12 @@ from numpy.typing import NDArray
 from psfcore.compiled import compiled
 from psfcore.convolution.fft_kernels import Plan, forward, inverse, make_plan
 from psfcore.convolution.lanes import LANES, join, scale, split, transpose, turn, turn_back
-from psfcore.convolution.lengths import good_length
+from psfcore.convolution.lengths import good_length, periodic_length
 from psfcore.convolution.offsets import needed_kernel
 from psfcore.errors import DataError
 
 BLOCK_ROWS = 2 * LANES
+PERIODIC = (0, 0)  # the span of a field that continues with its opposite side
 _SIZE = 2 * LANES  # numbers of sixteen complex values
 # Largest imaginary part of the transfer function of a symmetric PSF, as a share of the sum of weights. This
 # limit is smaller than the float32 rounding of the transfer function.
@@ -74,7 +75,8 @@ class Lines(NamedTuple):
 class Engine:
     """Convolution with one PSF, cut to one field, and the adjoint of this operator, in float32.
 
-    Raises DataError "field-shape" if an array has another shape.
+    Raises DataError "field-shape" if an array has another shape, and "periodic-size" if a periodic field has a size for
+    which there is no fast transform.
 
     Parameters
     ----------
@@ -86,7 +88,8 @@ class Engine:
         Distances (ny, nx): the convolution is exact for every pair of pixels that are closer to each other than this.
         Default: the shape of the field, so that the convolution is exact for all pairs. If the field includes a margin,
         a smaller span makes the transforms shorter. Pixels farther apart then lie in opposite margins, and light may
-        wrap from one to the other.
+        wrap from one to the other. PERIODIC: the field continues with its opposite side, and the transforms have its
+        size.
     threads
         Number of threads; it does not change the result.
     """
@@ -101,9 +104,15 @@ class Engine:
     ) -> None:
         self.field_shape = field_shape
         span = span or field_shape
-        kernel, first = needed_kernel(psf_kernel, span)
+        periodic = span == PERIODIC
+        # Weights farther than half of a period are left out.
+        kernel, first = needed_kernel(
+            psf_kernel, (field_shape[0] // 2, field_shape[1] // 2) if periodic else span
+        )
         ly, lx = (
-            good_length(max(size, joined + max(-low, low + count - 1, 0)))
+            periodic_length(size)
+            if periodic
+            else good_length(max(size, joined + max(-low, low + count - 1, 0)))
             for size, joined, low, count in zip(field_shape, span, first, kernel.shape, strict=True)
         )
         self.row_plan, self.column_plan = make_plan(lx), make_plan(ly)

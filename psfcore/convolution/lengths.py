@@ -4,6 +4,8 @@ too.
 
 from __future__ import annotations
 
+from psfcore.errors import DataError
+
 LARGEST_LENGTH = 16384
 _ODD_FACTORS = (1, 3, 5, 9)
 
@@ -17,3 +19,14 @@ def good_length(at_least: int) -> int:
     if not fitting:
         raise ValueError(f"expected a length of at most {LARGEST_LENGTH}; got {at_least}")
     return min(fitting)
+
+
+def periodic_length(size: int) -> int:
+    """The size of a field that continues periodically. Raises DataError "periodic-size" if it is not supported."""
+    if size > LARGEST_LENGTH or good_length(size) != size:
+        raise DataError(
+            "periodic-size",
+            "expected sides of 2^a, 3 2^a, 5 2^a or 9 2^a px with a >= 4, such as 2048 or 4096, for the edges "
+            f"periodic; got {size}: use other edges",
+        )
+    return size

@@ -41,7 +41,8 @@ class Conditions:
     edges
         Assumption about the scene beyond the field; None: the default of the method.
     margin_px
-        Width of the margin beyond the field; None: the width is computed from the PSF. Edges "zero" have no margin.
+        Width of the margin beyond the field; None: the width is computed from the PSF. Edges "zero" and "periodic" have
+        no margin.
     noise
         Noise of the camera; required if the stopping rule is "discrepancy".
     threads

@@ -15,7 +15,8 @@ from typing import Any, Literal
 from psfcore.errors import DataError
 
 KnownScene = Literal["zero", "symmetric"]  # beyond the edges
-Edges = Literal[KnownScene, "extended"]
+Edges = Literal[KnownScene, "extended", "periodic"]
+WITHOUT_MARGIN: tuple[Edges, ...] = ("zero", "periodic")
 Stop = Literal["fixed", "discrepancy"]
 Value = int | float
 MOST_STEPS = 1000  # far beyond the point from which steps fit the noise

@@ -18,6 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.convolution.offsets import needed_kernel
+from psfcore.deconvolve.declaration import Edges
+from psfcore.deconvolve.edges import light_across
 from psfcore.deconvolve.methods.registry import method_names, properties_of
 from psfcore.fits.units import parse_unit
 from psfcore.image import Image
@@ -37,7 +39,9 @@ _SAMPLE = 65_536
 _BESIDE = ((0, 1), (0, -1), (1, 0), (-1, 0))
 
 
-def input_warnings(psf: Psf, image: Image, method: str | None, *, channel: str | None) -> dict[str, str]:
+def input_warnings(
+    psf: Psf, image: Image, method: str | None, *, channel: str | None, edges: Edges | None = None
+) -> dict[str, str]:
     """Warnings about the inputs: sentences by their codes, the most harmful first.
 
     Parameters
@@ -46,6 +50,8 @@ def input_warnings(psf: Psf, image: Image, method: str | None, *, channel: str |
         The method of the deconvolution; None: none was chosen yet.
     channel
         The answer of `check_channel`.
+    edges
+        The scene beyond the edges of the image; None: not chosen.
     """
     warnings = frame_warnings(psf, image.header)
     warnings |= {} if channel is None else {"channel": channel}
@@ -59,6 +65,7 @@ def input_warnings(psf: Psf, image: Image, method: str | None, *, channel: str |
         warnings["saturation"] = image.saturation.warning
     if method is not None:
         warnings |= _cut_warning(psf, image)
+        warnings |= _across_warning(psf, image) if edges == "periodic" else {}
         warnings |= {} if properties_of(method).may_be_negative else _negative_warning(image)
         warnings |= pixel_warnings(image, psf.kernel)
     return warnings
@@ -79,6 +86,18 @@ def _cut_warning(psf: Psf, image: Image) -> dict[str, str]:
         "psf-cut": f"of the PSF of {nx} x {ny} px, the image needs {columns} x {rows} px: {100 * off:.3g} % of its "
         "light falls farther, and such light from sources beyond the image is not removed: use a larger image if it "
         "matters"
+    }
+
+
+def _across_warning(psf: Psf, image: Image) -> dict[str, str]:
+    """The warning that says how much light periodic edges bring from one edge to the opposite one."""
+    mean = float(image.pixels.mean(where=image.valid)) if image.valid.any() else 0.0
+    if mean <= 0:
+        return {}
+    share_pct = 100 * light_across(image, psf) / mean
+    return {
+        "periodic": "the edges periodic bring light from each edge to the opposite one: a pixel gets at most "
+        f"{share_pct:.2g} % of the mean of the image: use the edges symmetric if this matters"
     }
 
 

@@ -5,6 +5,9 @@
   margin is cut off.
 - extended: the scene is estimated on field and margin, although no pixel of the margin was observed
   (Bertero & Boccacci 2005, A&A 437, 369). The estimate starts from the mirror image.
+- periodic: the field continues with its opposite side, as in programs that use a Fourier transform of the size of the
+  image, such as aiapy. The transforms are the shortest ones, but light that leaves the field at one edge enters it at
+  the opposite edge.
 
 The PSF determines how far from an edge the scene beyond the edge matters. In a uniform scene, a pixel at distance d
 from a straight edge (d = 0 for the outermost pixels) receives the share b(d) of its light from beyond the edge:
@@ -13,11 +16,17 @@ from a straight edge (d = 0 for the outermost pixels) receives the share b(d) of
 
 b is the mean over the four edges of the image.
 
+With periodic edges, the light that enters at an edge is at most the light that falls just beyond the opposite edge:
+
+    w = max over k outside [0, N) of sum over i of l[k - i] m[i]      Eq. (2), for both axes, added
+
 | symbol | name | unit |
 |---|---|---|
 | d | distance from the edge | px |
 | o | offset from the PSF's centre, perpendicular to the edge | px |
 | b | share_from_beyond | - |
+| w | light_across | image unit |
+| m[i], N | largest absolute pixel of row or column i, and their number | image unit, - |
 """
 
 from __future__ import annotations
@@ -29,8 +38,8 @@ from typing import TypeVar, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.convolution.engine import BLOCK_ROWS
-from psfcore.deconvolve.declaration import Edges
+from psfcore.convolution.engine import BLOCK_ROWS, PERIODIC
+from psfcore.deconvolve.declaration import WITHOUT_MARGIN, Edges
 from psfcore.errors import DataError
 from psfcore.image import Image
 from psfcore.psf import Psf
@@ -92,8 +101,11 @@ class Domain:
         """Distance (ny, nx) within which the convolution must be exact.
 
         With extended edges, the distance covers every pixel whose light reaches the field. With other edges it is the
-        size of the field, because light need not travel from one margin to the opposite one.
+        size of the field, because light need not travel from one margin to the opposite one. Periodic edges have no
+        such distance.
         """
+        if self.edges == "periodic":
+            return PERIODIC
         sought = self.margin_px if self.edges == "extended" else 0
         ny, nx = (part.stop - part.start for part in self.field)
         return ny + sought, nx + sought
@@ -132,6 +144,23 @@ def share_from_beyond(psf: Psf) -> NDArray[np.float64]:
         beyond = line[centre + 1 :]
         shares[n, : beyond.size] = np.cumsum(beyond[::-1])[::-1]
     return np.asarray(shares.mean(axis=0)[: max(ny, nx) // 2 + 1])  # Eq. (1)
+
+
+def light_across(image: Image, psf: Psf) -> float:
+    """Compute w of Eq. (2): with periodic edges, no pixel gets more light than this from beyond the edges, if the
+    brightness of the scene is that of the image.
+    """
+    across = 0.0
+    for axis, n in enumerate(image.pixels.shape):
+        others = 1 - axis
+        brightest = np.maximum(
+            image.pixels.max(axis=others, where=image.finite, initial=0.0),
+            -image.pixels.min(axis=others, where=image.finite, initial=0.0),
+        )
+        weights = psf.kernel.sum(axis=others)
+        light, first = np.convolve(brightest, weights), weights.size // 2
+        across += float(np.concatenate([light[:first], light[first + n :]]).max(initial=0.0))  # Eq. (2)
+    return across
 
 
 def band_px(shares: NDArray[np.float64], fraction: float) -> int:
@@ -197,7 +226,7 @@ def lay_out(image: Image, *, edges: Edges, margin_px: int) -> Domain:
     scaled = np.empty(image.pixels.shape, np.float32)
     np.divide(image.pixels, scale, out=scaled, dtype=np.float64, casting="same_kind")
     np.copyto(scaled, 0, where=~finite)
-    margin = 0 if edges == "zero" else margin_px
+    margin = 0 if edges in WITHOUT_MARGIN else margin_px
     ny, nx = image.pixels.shape
     trusted = _continued(image.valid, margin)
     field = (slice(margin, margin + ny), slice(margin, margin + nx))

@@ -22,7 +22,7 @@ import math
 from dataclasses import dataclass
 
 from psfcore.convolution.lengths import LARGEST_LENGTH, good_length
-from psfcore.deconvolve.declaration import KnownScene
+from psfcore.deconvolve.declaration import WITHOUT_MARGIN, KnownScene
 from psfcore.deconvolve.methods.registry import method_names, properties_of
 from psfcore.errors import DataError
 
@@ -63,7 +63,7 @@ class Demand:
     @property
     def margin(self) -> int:
         """Expected width of the margin, px."""
-        if self.edges == "zero":
+        if self.edges in WITHOUT_MARGIN:
             return 0
         if self.margin_px is not None:
             return self.margin_px
@@ -79,6 +79,8 @@ class Demand:
     @property
     def transform(self) -> Shape:
         """Lengths of the transforms: the plane, and the light that crosses its edge must not wrap into the image."""
+        if self.edges == "periodic":
+            return self.image
         extended = (self.edges or properties_of(self.method).edges) == "extended"
         sought = self.margin if extended else 0
         ny, nx = (

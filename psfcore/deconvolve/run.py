@@ -394,7 +394,7 @@ def read_and_deconvolve(
     whole, fitted, channel = source.on_pixels_of(header, load)
     warnings = {
         **source.warnings,
-        **input_warnings(source.seen_as(fitted), image, options.method, channel=channel),
+        **input_warnings(source.seen_as(fitted), image, options.method, channel=channel, edges=options.edges),
     }
     for code, message in warnings.items():
         say(code, message)

@@ -49,7 +49,7 @@ from numpy.typing import NDArray
 from psfcore.deconvolve.assess.changes import Changes, QualityBit, measure_changes, quality_plane
 from psfcore.deconvolve.box import LARGEST_ERROR, Box, region_without_discrepancy, region_without_errors
 from psfcore.deconvolve.conditions import Conditions, Deconvolved, OfBox, Progress, fluxes
-from psfcore.deconvolve.declaration import Edges
+from psfcore.deconvolve.declaration import WITHOUT_MARGIN, Edges
 from psfcore.deconvolve.edges import margin_for, share_from_beyond
 from psfcore.deconvolve.methods.registry import method_named, properties_of
 from psfcore.errors import DataError
@@ -344,7 +344,7 @@ def box_work(work: Work, box: Box) -> BoxWork:
         )
     check_compatible(image, work.psf)
     edges = options.edges or method.edges
-    margin_px = 0 if edges == "zero" else options.margin_px
+    margin_px = 0 if edges in WITHOUT_MARGIN else options.margin_px
     if margin_px is None:
         margin_px = margin_for(share_from_beyond(work.psf), shape, share=method.margin_share)
     far = _FarLight(work, margin_px, method.keeps_flux)

@@ -8,6 +8,7 @@ import numpy as np
 
 from psfcore.convolution.convolver import linear_convolve
 from psfcore.deconvolve.conditions import Conditions, Deconvolved, Progress
+from psfcore.deconvolve.declaration import Edges
 from psfcore.deconvolve.methods.registry import method_named
 from psfcore.image import Image
 from psfcore.psf import Psf, crop_centred
@@ -23,8 +24,14 @@ def scattering_psf(size: int = 256, core_px: float = 0.8) -> Psf:
 
 
 def richardson_lucy(
-    image: Image, psf: Psf, *, steps: int = 20, threads: int = 1, progress: Progress | None = None
+    image: Image,
+    psf: Psf,
+    *,
+    steps: int = 20,
+    threads: int = 1,
+    progress: Progress | None = None,
+    edges: Edges = "zero",
 ) -> Deconvolved:
     """The published method: a fixed number of steps, and a scene that is zero beyond the field."""
-    conditions = Conditions(edges="zero", threads=threads, progress=progress)
+    conditions = Conditions(edges=edges, threads=threads, progress=progress)
     return method_named("richardson-lucy")(image, psf, conditions, steps=steps)

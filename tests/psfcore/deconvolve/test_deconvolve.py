@@ -12,9 +12,12 @@ import pytest
 from astropy.io import fits
 from numpy.typing import NDArray
 
+from psfcore.convolution.engine import PERIODIC, Engine
 from psfcore.deconvolve.doubts import input_warnings
+from psfcore.deconvolve.edges import light_across
 from psfcore.deconvolve.run import deconvolve
 from psfcore.deconvolve.work import Options
+from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.observation import read_observation
 from psfcore.fits.psfs import read_psf
@@ -135,3 +138,35 @@ def test_rebinning_keeps_the_light_of_a_psf_that_sums_to_1_beyond_the_reach(larg
     assert rebinned(by_reach, 4).total == pytest.approx(1, abs=1e-12), (
         "the light beyond the reach is left out"
     )
+
+
+def test_periodic_edges_are_those_of_a_transform_of_the_size_of_the_image() -> None:
+    """The steps with the transforms of numpy, on an image whose sides have different factors."""
+    pixels = solar_scene((80, 144), 3)
+    pixels[:, :8] += 500
+    psf = scattering_psf(72, 1.0)
+    wrapped = np.zeros(pixels.shape)
+    for (y, x), weight in np.ndenumerate(psf.kernel):
+        wrapped[y - 36, x - 36] += weight
+    transfer, expected = np.fft.rfft2(wrapped), pixels
+    for _ in range(10):
+        model = np.fft.irfft2(np.fft.rfft2(expected) * transfer, s=pixels.shape)
+        expected = expected * np.fft.irfft2(np.fft.rfft2(pixels / model) * transfer.conj(), s=pixels.shape)
+    result = richardson_lucy(make_image(pixels), psf, steps=10, edges="periodic")
+    np.testing.assert_allclose(result.pixels, expected, atol=1e-6 * expected.max())
+    assert (result.margin_px, result.edges) == (0, "periodic")
+
+
+def test_the_light_that_periodic_edges_bring_across_is_told() -> None:
+    pixels = np.random.default_rng(1).uniform(50, 100, (IMAGE_PX, IMAGE_PX))
+    pixels[:, :3] += 300
+    psf = scattering_psf(IMAGE_PX, 1.0)
+    across = light_across(make_image(pixels), psf)
+    alone, periodic = (
+        Engine(psf.kernel, pixels.shape, span=span).apply(pixels) for span in (pixels.shape, PERIODIC)
+    )
+    assert 0.4 * across < (periodic - alone).max() < across
+    warned = input_warnings(psf, make_image(pixels), "linear", channel=None, edges="periodic")
+    assert f"at most {100 * across / pixels.mean():.2g} %" in warned["periodic"]
+    with pytest.raises(DataError, match="periodic-size"):
+        richardson_lucy(make_image(pixels[:50]), psf, steps=1, edges="periodic")
