@@ -103,11 +103,11 @@ def find_artefacts(pair: Compared, peak_weight: float, *, sigma: NoiseAt | None 
     before = pair.before
     classes = classes_of(pair.portions(before.__getitem__))
     noise_after = noise_levels(pair, pair.after, classes)
-    noise_before = sigma or _estimated_noise(pair, classes)
+    noise_before, least = (sigma, 0.0) if sigma else _estimated_noise(pair, classes)
     suspected = np.zeros_like(pair.counted)
     counts: dict[str, int] = {}
     for name, sign in (
-        ("holes_ppm", _holes(pair, noise_before)),
+        ("holes_ppm", _holes(pair, noise_before, least)),
         ("overshoots_ppm", _overshoots(pair, noise_before, peak_weight)),
         ("new_extremes_ppm", _new_extremes(pair, noise_before, noise_after)),
     ):
@@ -198,10 +198,12 @@ def noise_levels(pair: Compared, plane: Plane, classes: BrightnessClasses) -> No
     return NoiseLevels(classes.centres, levels, 1e-6 * largest + np.finfo(float).tiny)
 
 
-def _estimated_noise(pair: Compared, classes: BrightnessClasses) -> NoiseAt:
-    """The noise before the deconvolution, estimated from the pixels themselves, as a function of their brightness."""
+def _estimated_noise(pair: Compared, classes: BrightnessClasses) -> tuple[NoiseAt, float]:
+    """The noise before the deconvolution, estimated from the pixels themselves, as a function of their brightness; and
+    its smallest value.
+    """
     levels = noise_levels(pair, pair.before, classes)
-    return lambda at: levels.at(pair.before[at])
+    return lambda at: levels.at(pair.before[at]), levels.least
 
 
 def second_differences(plane: Plane, counted: Flags) -> Plane:
@@ -236,13 +238,13 @@ def ringing_pct(pair: Compared) -> tuple[float | None, int]:
 # be all pixels, so each sign is looked for in a block of rows at a time.
 
 
-def _holes(pair: Compared, noise_before: NoiseAt) -> Sign:
-    """The compared pixels that fulfil Eq. (1)."""
+def _holes(pair: Compared, noise_before: NoiseAt, least: float) -> Sign:
+    """The compared pixels that fulfil Eq. (1). No noise before is below `least`."""
 
     def holes(rows: slice) -> Flags:
         before = pair.before[rows]
-        found = (pair.after[rows] < HOLE_SHARE * before) & (before > 0)
-        found &= pair.counted[rows]
+        found = pair.counted[rows] & (pair.after[rows] < HOLE_SHARE * before)
+        found &= before > 0.999 * DETECTION_SIGMA * least  # the noise of a pixel is rounded differently: the factor
         y, x = _places(found)
         places = (y + rows.start, x)
         found[y, x] = pair.before[places] > DETECTION_SIGMA * noise_before(places)
