@@ -29,11 +29,11 @@ from psfcore.errors import DataError
 EXPECTED_RIM_PX = 384  # for estimates; the width of the rim follows from the pixels
 
 Shape = tuple[int, int]
-IMAGE_BYTES = 20.0  # the image and the result in float64, the mask, and a comparison of both
+IMAGE_BYTES = 20.0  # the image in float64, the result and the compared planes in float32, and the masks
 ERRORS_BYTES = 240.0  # further bytes for each pixel of the image, if errors are estimated
 PSF_BYTES = 8.0
 ASSESSED_BYTES = (
-    35.0  # for each pixel of an image: to measure the changes, and to draw the pictures of a product
+    12.0  # for each pixel of an image: to measure the changes, and to draw the pictures of a product
 )
 # Of a convolution: the measured memory with images of 1024 to 3072 px and PSFs of 512 and 2048 px, rounded up.
 CONVOLVED_PLANE_BYTES, CONVOLVED_TRANSFORM_BYTES, CONVOLVED_IMAGE_BYTES = 8.0, 12.0, 24.0

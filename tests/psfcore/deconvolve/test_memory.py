@@ -39,7 +39,12 @@ def test_the_transforms_are_those_of_the_engine() -> None:
         return engines[-1]
 
     for method in method_names():
-        for edges, shape in (("zero", (96, 130)), ("symmetric", (96, 96)), (None, (64, 200))):
+        for edges, shape in (
+            ("zero", (96, 130)),
+            ("symmetric", (96, 96)),
+            ("periodic", (96, 80)),
+            (None, (64, 200)),
+        ):
             conditions = Conditions(edges=edges, margin_px=16, engine_for=engine_for)  # type: ignore[arg-type]
             method_named(method)(make_image(np.full(shape, 5.0)), psf, conditions, steps=1)
             sizes = Demand(method, shape, (80, 80), edges=edges, margin_px=16)
