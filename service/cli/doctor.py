@@ -26,8 +26,8 @@ from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
 from psfcore import limited
-from psfcore.compiled import folder_of_kernels
 from psfcore.files import CACHE_VARIABLE
+from psfcore.kernel_files import folder_of_kernels
 from service.cli.operator import sentence
 from service.cli.options import DATA, read_settings
 from service.cli.progress import duration, echo
