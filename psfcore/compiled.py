@@ -13,7 +13,7 @@ from importlib import import_module
 from pathlib import Path
 from threading import RLock
 from types import FunctionType
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -23,14 +23,14 @@ from psfcore.machine_code import Linked, Unlinkable
 # One thread at a time loads or compiles kernels.
 _LOADING = RLock()
 # How numba spells numbers.
-_NUMBERS = {
+_NUMBERS: dict[np.dtype[np.generic], str] = {
     np.dtype(name): name
     for name in (
         "bool", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float32", "float64",
         "complex64", "complex128",
     )
 }  # fmt: skip
-_SCALARS = {
+_SCALARS: dict[type, str] = {
     bool: "bool",
     int: "int64",
     float: "float64",
@@ -38,12 +38,6 @@ _SCALARS = {
     type(None): "none",
     **{kind.type: name for kind, name in _NUMBERS.items()},
 }
-
-
-class HasAddress(Protocol):
-    """Machine code in this process."""
-
-    address: int
 
 
 class Unknown(TypeError):
@@ -90,6 +84,8 @@ class Later:
 class Kernel:
     """A function that is compiled for each combination of types of its arguments, when it is first called with them."""
 
+    __qualname__: str
+
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
         update_wrapper(self, function)
         self._function, self._options = function, options
@@ -134,13 +130,16 @@ class Addressed:
         compiled if it is not kept there.
         """
         with _LOADING:
-            self._code = _linked(self.files, self._signature) or self._compiled()
-        return self._code.address
+            linked = _linked(self.files, self._signature)
+            if linked is not None:
+                self._kept: object = linked
+                return linked.address
+            from psfcore.compiling import callback
 
-    def _compiled(self) -> HasAddress:
-        from psfcore.compiling import callback
-
-        return callback(_for_compiler(self._function), self._signature, self._options, self.files)
+            kernel = callback(_for_compiler(self._function), self._signature, self._options, self.files)
+            self._kept = kernel
+            assert kernel.address is not None  # it is compiled
+            return kernel.address
 
 
 def compiled(

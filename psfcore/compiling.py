@@ -21,13 +21,16 @@ from numba.core.typing.templates import Signature
 from psfcore.kernel_files import Kept, KernelFiles
 from psfcore.machine_code import MachineCode
 
+Result = Any  # a CompileResult, whose attributes numba does not declare
+
 
 def dispatcher(
     function: Callable[..., Any], options: dict[str, Any], files: KernelFiles
 ) -> Callable[..., Any]:
     """`numba.njit` of a function, which releases the interpreter's lock. Its machine code is kept in files."""
     # Without the wrapper for callers in C: nothing calls it, and it takes time to compile.
-    kernel: Callable[..., Any] = njit(**options, nogil=True, no_cfunc_wrapper=True)(function)
+    options = {**options, "nogil": True, "no_cfunc_wrapper": True}
+    kernel: Callable[..., Any] = njit(**options)(function)
     if isinstance(kernel, Dispatcher):  # it is a plain function if compilation is switched off
         kernel._cache = KernelCache(files)  # type: ignore[attr-defined]  # numba has no public way
     return kernel
@@ -37,8 +40,8 @@ def callback(
     function: Callable[..., Any], signature: str, options: dict[str, Any], files: KernelFiles
 ) -> CFunc:
     """`numba.cfunc` of a function, whose machine code is kept in files. It is compiled if it is not kept yet."""
-    kernel: Any = CFunc(function, normalize_signature(signature), {}, options)
-    kernel._cache = KernelCache(files, signature)
+    kernel = CFunc(function, normalize_signature(signature), {}, options)
+    kernel._cache = KernelCache(files, signature)  # type: ignore[attr-defined]  # as above
     kernel.compile()
     return kernel
 
@@ -61,9 +64,7 @@ class KernelCache(_Cache):
     def cache_path(self) -> str:
         return str(self._files.folders[0])
 
-    def load_overload(
-        self, sig: Signature | tuple[Type, ...], target_context: BaseContext
-    ) -> CompileResult | None:
+    def load_overload(self, sig: Signature | tuple[Type, ...], target_context: BaseContext) -> Result:
         """The machine code for these types of arguments; None if it is not on disk.
 
         numba's own method first makes all types and functions known to the compiler, which takes longer than to load
@@ -77,7 +78,7 @@ class KernelCache(_Cache):
         parts = pickle.loads(kept.for_numba)  # noqa: S301  # nobody else can write to the folder
         return CompileResult._rebuild(target_context, *parts)
 
-    def save_overload(self, sig: Signature | tuple[Type, ...], cres: CompileResult) -> None:
+    def save_overload(self, sig: Signature | tuple[Type, ...], cres: Result) -> None:
         if not (cres.lifted or cres.library.has_dynamic_globals):  # else an address of this process is in it
             parts = cres._reduce()
             kept = Kept(_machine_code(cres, parts[0], by_address=self._key is not None), dumps(parts))
@@ -93,7 +94,7 @@ class KernelCache(_Cache):
 
 
 def _machine_code(
-    result: CompileResult, library: tuple[str, str, tuple[bytes, bytes]], *, by_address: bool
+    result: Result, library: tuple[str, str, tuple[bytes, bytes]], *, by_address: bool
 ) -> MachineCode | None:
     """What runs a kernel without numba; None if numba must prepare something each time.
 
@@ -113,8 +114,10 @@ def _machine_code(
         code=library[2][0],
         entry=names.llvm_cfunc_wrapper_name if by_address else names.llvm_cpython_wrapper_name,
         environments=tuple(
-            (one.env_name, list(one.consts))
-            for one in (result.environment, *result._find_referenced_environments())
+            {
+                one.env_name: (one.env_name, list(one.consts))
+                for one in (result.environment, *result._find_referenced_environments())
+            }.values()
         ),
         needed=tuple(name for name in outside if not name.startswith("llvm.")),
     )

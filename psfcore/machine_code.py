@@ -2,9 +2,10 @@
 any other library.
 
 numba compiles for each kernel a wrapper that takes Python's objects and returns one. The wrapper calls functions of
-three extension modules of numba: they convert arrays, raise exceptions and manage memory. These modules do not need the
-rest of numba. This module loads them as numba does, tells LLVM the addresses of their functions, and lets LLVM link the
-object code. Each kernel is linked by itself, so that symbols of two kernels cannot be confused.
+three extension modules of numba: they convert arrays, raise exceptions and manage memory. They import the rest of numba
+only if a kernel returns an array or raises an exception. This module loads them as numba does, tells LLVM the addresses
+of their functions, and lets LLVM link the object code. Each kernel is linked by itself, so that symbols of two kernels
+cannot be confused.
 """
 
 from __future__ import annotations
@@ -21,8 +22,6 @@ from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
-
-from llvmlite import binding
 
 # The parts of numba that machine code calls, with the beginnings of the names by which it calls their functions.
 _PARTS = {"_helperlib": "numba_", "_dynfunc": "numba_", "core.runtime._nrt_python": "NRT_"}
@@ -54,6 +53,8 @@ def processor() -> tuple[str, str, str]:
     """The processor for which numba compiles: operating system, name and features. numba's variables can name another
     one than that of this machine, such as the oldest processor that runs a container.
     """
+    from llvmlite import binding  # not needed until a kernel runs
+
     name, features = (os.environ.get(f"NUMBA_CPU_{part}") for part in ("NAME", "FEATURES"))
     if name is None:
         name = binding.get_host_cpu_name()
@@ -78,6 +79,8 @@ class Linked:
     """
 
     def __init__(self, machine: MachineCode) -> None:
+        from llvmlite import binding
+
         self._parts = _parts()
         target = binding.Target.from_triple(binding.get_process_triple())
         # The options are numba's. The code is compiled already, so none of them changes it.
@@ -116,6 +119,8 @@ def _parts() -> dict[str, ModuleType]:
     """
     if platform.machine() not in ("x86_64", "AMD64"):
         raise Unlinkable(platform.machine())
+    from llvmlite import binding
+
     parts = {name: _extension(name) for name in _PARTS}
     parts["core.runtime._nrt_python"].memsys_use_cpython_allocator()
     binding.initialize_native_target()

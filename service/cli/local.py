@@ -35,7 +35,6 @@ from psfcore.gap.effect_sources import sha256_of_source
 from psfcore.instruments.unknown import unknown_instrument
 from psfcore.instruments.workload import check_workload
 from psfcore.kernel_files import listening
-from psfcore.transit.archive import list_archive, transit_in
 from service.cli.local_workspace import ImageFile, Inputs, LocalWorkspace, PsfFile, TransitFiles, states_of
 from service.client.answers import Ended, Json, Submitted, Uploaded
 from service.client.errors import ServiceError
@@ -106,6 +105,8 @@ class Local(Operations):
 
     def upload_transit(self, path: str | Path) -> Uploaded:
         """Add a transit, after the same check of its table of contents as in a service."""
+        from psfcore.transit.archive import list_archive, transit_in  # a deconvolution does not need it
+
         path = Path(path)
         if path.is_dir():
             path = path.resolve()
