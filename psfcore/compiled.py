@@ -22,6 +22,7 @@ from psfcore.machine_code import Linked, Unlinkable
 
 # One thread at a time loads or compiles kernels.
 _LOADING = RLock()
+KERNELS: list[Kernel | Addressed] = []  # those of the modules that are imported
 # How numba spells numbers.
 _NUMBERS: dict[np.dtype[np.generic], str] = {
     np.dtype(name): name
@@ -91,6 +92,7 @@ class Kernel:
         self._function, self._options = function, options
         self._entries: dict[str, Callable[..., Any]] = {}
         self.files = _files_of(function)
+        KERNELS.append(self)
 
     def __call__(self, *arguments: Any) -> Any:
         try:
@@ -123,6 +125,7 @@ class Addressed:
         self._function, self._signature, self._options = function, signature, options
         self.__qualname__ = function.__qualname__
         self.files = _files_of(function)
+        KERNELS.append(self)
 
     @cached_property
     def address(self) -> int:
@@ -193,13 +196,14 @@ def is_kept(kernel: object) -> bool:
     """Whether the disk has machine code of a kernel, compiled from the current sources, for any types of its
     arguments.
     """
-    return not isinstance(kernel, Kernel) or kernel.files.any_kept()
+    assert isinstance(kernel, Kernel | Addressed)
+    return kernel.files.any_kept()
 
 
 def _files_of(function: Callable[..., Any]) -> KernelFiles:
     source, code = Path(function.__code__.co_filename), function.__code__
     constants = tuple(cell.cell_contents for cell in function.__closure__ or ())
-    stem = f"{function.__module__.rpartition('.')[2]}.{function.__qualname__}-{code.co_firstlineno}"
+    stem = f"{function.__module__}.{function.__qualname__}-{code.co_firstlineno}"
     return KernelFiles(folders_of(source), stem, source_stamp(source), repr((code.co_code, constants)))
 
 

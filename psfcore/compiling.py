@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from numba import njit
 from numba.core.base import BaseContext
 from numba.core.caching import _Cache
@@ -13,7 +13,7 @@ from numba.core.ccallback import CFunc
 from numba.core.compiler import CompileResult
 from numba.core.dispatcher import Dispatcher
 from numba.core.runtime.nrt import rtsys
-from numba.core.serialize import dumps
+from numba.core.serialize import dumps, loads
 from numba.core.sigutils import normalize_signature
 from numba.core.types import Type
 from numba.core.typing.templates import Signature
@@ -75,8 +75,7 @@ class KernelCache(_Cache):
         kept = self._files.load(self._key_of(sig))
         if kept is None:
             return None
-        parts = pickle.loads(kept.for_numba)  # noqa: S301  # nobody else can write to the folder
-        return CompileResult._rebuild(target_context, *parts)
+        return CompileResult._rebuild(target_context, *loads(kept.for_numba))
 
     def save_overload(self, sig: Signature | tuple[Type, ...], cres: Result) -> None:
         if not (cres.lifted or cres.library.has_dynamic_globals):  # else an address of this process is in it
@@ -105,7 +104,11 @@ def _machine_code(
     by_address
         Whether the kernel is called by its address.
     """
-    if result.reload_init or result.objectmode:
+    environments = {
+        one.env_name: one.consts for one in (result.environment, *result._find_referenced_environments())
+    }
+    values = [value for some in environments.values() for value in some]
+    if result.reload_init or result.objectmode or not all(isinstance(value, np.dtype) for value in values):
         return None
     names = result.fndesc
     module = result.library._final_module
@@ -113,11 +116,6 @@ def _machine_code(
     return MachineCode(
         code=library[2][0],
         entry=names.llvm_cfunc_wrapper_name if by_address else names.llvm_cpython_wrapper_name,
-        environments=tuple(
-            {
-                one.env_name: (one.env_name, list(one.consts))
-                for one in (result.environment, *result._find_referenced_environments())
-            }.values()
-        ),
-        needed=tuple(name for name in outside if not name.startswith("llvm.")),
+        environments=[(name, [kind.str for kind in kinds]) for name, kinds in environments.items()],
+        needed=[name for name in outside if not name.startswith("llvm.")],
     )

@@ -22,9 +22,9 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import json
 import logging
 import os
-import pickle
 import stat
 import sys
 import uuid
@@ -42,6 +42,7 @@ from psfcore.machine_code import MachineCode, processor
 # thread of a job compiles is not reported.
 _LISTENER: ContextVar[Callable[[bool], None] | None] = ContextVar("listener", default=None)
 FOLDER_VARIABLE = "NUMBA_CACHE_DIR"
+SUFFIX = ".nbc"  # of kernel files
 SEAL_BYTES = 2 * hashlib.sha256().digest_size
 MARK = b"@compiled"  # the decorators of `psfcore.compiled`
 SOURCE = Path(__file__)
@@ -88,15 +89,17 @@ def _tell(*, done: bool) -> None:
 
 
 def folders_of(source: Path) -> tuple[Path, Path]:
-    """The folders in which the kernels of a source file are looked for. They may not exist: `KernelFiles` checks
-    them.
+    """The folders in which the kernels of a source file are looked for. They may not exist: `KernelFiles` checks them.
+
+    All kernels of this package are in one folder.
     """
+    package = SOURCE.parent
+    root = package if source.is_relative_to(package) else source.parent
     named = os.environ.get(FOLDER_VARIABLE)
     if not named:
-        return source.parent / "__pycache__", private_folder()
+        return root / "__pycache__", private_folder()
     # The source files of another installation have kernels of the same names.
-    own = f"{source.parent.name}_{_short(str(source.parent))}"
-    return Path(named) / own, private_folder()
+    return Path(named) / f"{root.name}_{_short(str(root))}", private_folder()
 
 
 def private_folder() -> Path:
@@ -195,8 +198,7 @@ class KernelFiles:
             path = folder / self._name(key)
             content = self._content(path) if trusted(folder) and trusted(path) else None
             if content is not None:
-                machine_code, for_numba = pickle.loads(content)  # noqa: S301  # nobody else can write to the folder
-                return Kept(machine_code and MachineCode(*machine_code), for_numba)
+                return _unpacked(content)
         return None
 
     def save(self, key: str, kept: Kept) -> None:
@@ -206,7 +208,7 @@ class KernelFiles:
         if folder is None:
             _tell_not_kept(self.folders[-1], "it cannot be made, or others can write to it")
             return
-        payload = pickle.dumps((kept.machine_code and tuple(kept.machine_code), kept.for_numba))
+        payload = _packed(kept)
         path = folder / self._name(key)
         partial = path.with_name(f"{path.name}.{uuid.uuid4().hex}")
         try:
@@ -223,14 +225,16 @@ class KernelFiles:
         return any(
             self._content(path) is not None
             for folder in self.folders
-            for path in folder.glob(f"{self._stem}.*.nbc")
+            for path in folder.glob(f"{self._stem}.*{SUFFIX}")
         )
 
     def _content(self, path: Path) -> bytes | None:
-        """The pickled content of a file; None if there is no such file, or it is of other sources, or not whole."""
+        """The content of a file without its seal; None if this user can read no such file, or it is of other sources,
+        or not whole.
+        """
         try:
             content = path.read_bytes()
-        except FileNotFoundError:
+        except (FileNotFoundError, PermissionError):
             return None
         payload = content[:-SEAL_BYTES]
         return payload if content[-SEAL_BYTES:] == self._seal(payload) else None
@@ -240,7 +244,22 @@ class KernelFiles:
         return hashlib.sha256(stamp.encode()).digest() + hashlib.sha256(payload).digest()
 
     def _name(self, key: str) -> str:
-        return f"{self._stem}.{_short(repr((compiler_version(), processor(), self._code, key)))}.nbc"
+        return f"{self._stem}.{_short(repr((compiler_version(), processor(), self._code, key)))}{SUFFIX}"
+
+
+def _packed(kept: Kept) -> bytes:
+    """The content of a kernel file: a line of JSON, the object code, and what numba needs."""
+    machine = kept.machine_code
+    about = None if machine is None else machine._asdict()
+    code = b"" if about is None else about.pop("code")
+    return json.dumps({"machine_code": about, "bytes": len(code)}).encode() + b"\n" + code + kept.for_numba
+
+
+def _unpacked(content: bytes) -> Kept:
+    head, _, rest = content.partition(b"\n")
+    fields = json.loads(head)
+    about, size = fields["machine_code"], fields["bytes"]
+    return Kept(None if about is None else MachineCode(code=rest[:size], **about), rest[size:])
 
 
 def _short(text: str) -> str:

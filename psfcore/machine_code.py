@@ -16,12 +16,14 @@ import importlib.util
 import os
 import platform
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
+
+import numpy as np
 
 # The parts of numba that machine code calls, with the beginnings of the names by which it calls their functions.
 _PARTS = {"_helperlib": "numba_", "_dynfunc": "numba_", "core.runtime._nrt_python": "NRT_"}
@@ -37,15 +39,16 @@ class MachineCode(NamedTuple):
     entry
         The symbol that is called.
     environments
-        Symbols that must point to an environment, and the Python objects that each environment holds.
+        Symbols that must point to an environment, and the types of numbers that each environment holds, as numpy names
+        them.
     needed
         Symbols outside the object code.
     """
 
     code: bytes
     entry: str
-    environments: tuple[tuple[str, list[object]], ...]
-    needed: tuple[str, ...]
+    environments: Sequence[tuple[str, list[str]]]
+    needed: Sequence[str]
 
 
 @cache
@@ -95,9 +98,9 @@ class Linked:
         self.address: int = self._engine.get_function_address(machine.entry)
         self._environments = [self._environment(*one) for one in machine.environments]
 
-    def _environment(self, symbol: str, values: list[object]) -> object:
+    def _environment(self, symbol: str, kinds: list[str]) -> object:
         environment = self._parts["_dynfunc"].Environment({})
-        environment.consts.extend(values)
+        environment.consts.extend(map(np.dtype, kinds))
         place = self._engine.get_global_value_address(symbol)
         if place:
             ctypes.c_void_p.from_address(place).value = id(environment)  # as numba's own set_env does
