@@ -61,6 +61,8 @@ def processor() -> tuple[str, str, str]:
     name, features = (os.environ.get(f"NUMBA_CPU_{part}") for part in ("NAME", "FEATURES"))
     if name is None:
         name = binding.get_host_cpu_name()
+    elif features is None and name.lower() == "generic":
+        features = ""  # as numba has it
     if features is None:
         features = f"{binding.get_host_cpu_features().flatten()} {os.environ.get('NUMBA_ENABLE_AVX', '')}"
     return binding.get_process_triple(), name, features
