@@ -13,14 +13,19 @@ RUN python -m venv /opt/heliopsf \
 
 FROM python:3.11-slim
 COPY --from=build /opt/heliopsf /opt/heliopsf
-RUN useradd --create-home --uid 10001 heliopsf \
+# The oldest processor on which the compiled kernels of this image run; see docs/operating.md.
+ARG KERNELS_CPU=x86-64-v3
+ENV PATH=/opt/heliopsf/bin:$PATH \
+    PYTHONUNBUFFERED=1 \
+    NUMBA_CPU_NAME=$KERNELS_CPU \
+    NUMBA_CPU_FEATURES= \
+    NUMBA_CACHE_DIR=/opt/heliopsf/kernels
+RUN heliopsf doctor --compile \
+ && useradd --create-home --uid 10001 heliopsf \
  && install -d -o heliopsf -g heliopsf /data
 USER heliopsf
-# Libraries write their caches below HOME and NUMBA_CACHE_DIR; /tmp is the only such folder that a read-only container has.
-ENV PATH=/opt/heliopsf/bin:$PATH \
-    HOME=/tmp \
-    PYTHONUNBUFFERED=1 \
-    NUMBA_CACHE_DIR=/tmp/numba \
+# Libraries write their caches below HOME; /tmp is the only such folder that a read-only container has.
+ENV HOME=/tmp \
     HELIOPSF_DATA_DIR=/data
 VOLUME /data
 EXPOSE 8765

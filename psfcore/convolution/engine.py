@@ -26,17 +26,21 @@ import queue
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
-from typing import NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.compiled import compiled
+from psfcore.compiled import Later, compiled
 from psfcore.convolution.fft_kernels import Plan, forward, inverse, make_plan
-from psfcore.convolution.lanes import LANES, join, scale, split, transpose, turn, turn_back
-from psfcore.convolution.lengths import good_length, periodic_length
+from psfcore.convolution.lengths import LANES, good_length, periodic_length
 from psfcore.convolution.offsets import needed_kernel
 from psfcore.errors import DataError
+
+if TYPE_CHECKING:
+    from psfcore.convolution import lanes as instructions
+else:
+    instructions = Later("psfcore.convolution.lanes")
 
 BLOCK_ROWS = 2 * LANES
 PERIODIC = (0, 0)  # the span of a field that continues with its opposite side
@@ -389,11 +393,12 @@ def rows_to_spectrum(lines: Lines, block: int, nx: int) -> None:
             if k > last:
                 corner[kk] = np.float32(0.0)
             else:
-                split(buffer, corner, place[k] * _SIZE, place[(length - k) % length] * _SIZE, kk * 2 * _SIZE)
+                p, q = place[k] * _SIZE, place[(length - k) % length] * _SIZE
+                instructions.split(buffer, corner, p, q, kk * 2 * _SIZE)
         row = group * rows + block * BLOCK_ROWS
         for part in range(4):
             here = (row + part // 2 * LANES) * _SIZE + part % 2 * LANES
-            transpose(corner, spectrum, part * LANES, 2 * _SIZE, here, _SIZE)
+            instructions.transpose(corner, spectrum, part * LANES, 2 * _SIZE, here, _SIZE)
 
 
 @compiled()
@@ -411,10 +416,10 @@ def rows_from_spectrum(lines: Lines, block: int) -> Single:
         row = group * rows + block * BLOCK_ROWS
         for part in range(4):
             here = (row + part // 2 * LANES) * _SIZE + part % 2 * LANES
-            transpose(spectrum, corner, here, _SIZE, part * LANES, 2 * _SIZE)
+            instructions.transpose(spectrum, corner, here, _SIZE, part * LANES, 2 * _SIZE)
         for k in range(group * LANES, min((group + 1) * LANES, last + 1)):
             at = (k - group * LANES) * 2 * _SIZE
-            join(corner, buffer, at, place[k] * _SIZE, place[(length - k) % length] * _SIZE)
+            instructions.join(corner, buffer, at, place[k] * _SIZE, place[(length - k) % length] * _SIZE)
     inverse(buffer, lines.plan)
     return buffer.reshape((-1, 2, LANES))
 
@@ -469,10 +474,10 @@ def _columns(lines: Lines, start: int, stop: int, transfer: Single, conjugate: b
         forward(buffer, lines.plan)
         for k in range(length):
             if transfer.shape[2] == 1:
-                scale(buffer, transfer, k * _SIZE, (group * length + k) * LANES)
+                instructions.scale(buffer, transfer, k * _SIZE, (group * length + k) * LANES)
             elif conjugate:
-                turn_back(buffer, transfer, k * _SIZE, (group * length + k) * _SIZE)
+                instructions.turn_back(buffer, transfer, k * _SIZE, (group * length + k) * _SIZE)
             else:
-                turn(buffer, transfer, k * _SIZE, (group * length + k) * _SIZE)
+                instructions.turn(buffer, transfer, k * _SIZE, (group * length + k) * _SIZE)
         inverse(buffer, lines.plan)
         _copy(buffer, column, filled)

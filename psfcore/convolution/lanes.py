@@ -1,4 +1,5 @@
 """Instructions on sixteen neighbouring numbers ("lanes"), for the kernels (`@compiled`) of `fft_kernels` and `engine`.
+Only the compiler needs this module: it imports numba.
 
 A kernel calls the functions of this module like other functions; each of them becomes vector instructions. Loops over
 the lanes would have the same meaning. However, the compiler can turn such a loop into vector instructions only after it
@@ -15,7 +16,6 @@ from functools import cache, partial
 
 import numpy as np
 from llvmlite import ir
-from llvmlite.binding import get_host_cpu_features
 from numba import types
 from numba.core.base import BaseContext
 from numba.core.cgutils import get_or_insert_function
@@ -23,7 +23,8 @@ from numba.core.errors import TypingError
 from numba.core.typing.templates import Signature
 from numba.extending import intrinsic
 
-LANES = 16
+from psfcore.convolution.lengths import LANES
+from psfcore.machine_code import processor
 
 # What an intrinsic of numba returns: the types of its arguments, and the function that writes its instructions.
 Written = tuple[Signature, Callable[..., ir.Value]]
@@ -115,10 +116,10 @@ def _places(indices: Sequence[int]) -> ir.Constant:
 
 @cache
 def width() -> int:
-    """The number of lanes in a vector register of this processor; 8 is good for processors with shorter registers
+    """The number of lanes in a vector register of the processor; 8 is good for processors with shorter registers
     too.
     """
-    return 16 if get_host_cpu_features().get("avx512f") else 8
+    return 16 if "+avx512f" in processor()[2] else 8
 
 
 def parts() -> range:

@@ -1,11 +1,12 @@
-"""The lengths of Fourier transforms. This file imports no numerical libraries, because estimates of memory need it
-too.
+"""The lengths of Fourier transforms, and how many the kernels (`@compiled`) compute side by side. This file imports no
+numerical libraries, because estimates of memory need it too.
 """
 
 from __future__ import annotations
 
 from psfcore.errors import DataError
 
+LANES = 16
 LARGEST_LENGTH = 16384
 _ODD_FACTORS = (1, 3, 5, 9)
 

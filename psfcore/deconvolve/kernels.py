@@ -15,7 +15,7 @@ from contextlib import contextmanager
 import numpy as np
 from astropy.io.fits import Header
 
-from psfcore.compiled import folder_of_kernels, is_kept
+from psfcore.compiled import is_kept
 from psfcore.convolution import engine
 from psfcore.convolution.fft_kernels import make_plan
 from psfcore.convolution.lengths import LARGEST_LENGTH, good_length
@@ -23,6 +23,7 @@ from psfcore.deconvolve.assess.changes import measure_changes
 from psfcore.deconvolve.conditions import Conditions
 from psfcore.deconvolve.methods.registry import method_named
 from psfcore.image import Image
+from psfcore.kernel_files import folder_of_kernels
 from psfcore.psf import REACH_GRID_PX, Psf
 
 SIZE_PX = 32

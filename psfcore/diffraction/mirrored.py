@@ -37,8 +37,7 @@ from numpy.typing import NDArray
 
 from psfcore.compiled import compiled
 from psfcore.convolution.fft_kernels import forward, make_plan
-from psfcore.convolution.lanes import LANES
-from psfcore.convolution.lengths import LARGEST_LENGTH, good_length
+from psfcore.convolution.lengths import LANES, LARGEST_LENGTH, good_length
 from psfcore.diffraction.pupil import MaskGrid
 
 BLOCK = 2 * LANES

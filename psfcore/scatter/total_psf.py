@@ -53,7 +53,7 @@ from numpy.typing import NDArray
 from psfcore.arrays import Kernel, Matrix, Vector
 from psfcore.convolution.convolver import Convolver
 from psfcore.convolution.engine import BLOCK_ROWS, Engine
-from psfcore.convolution.lanes import LANES
+from psfcore.convolution.lengths import LANES
 from psfcore.deconvolve.assess.error_planes import sigma_points
 from psfcore.deconvolve.iterations.linear import inverse_filter, solve_linear, transfer_sample
 from psfcore.errors import DataError

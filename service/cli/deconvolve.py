@@ -33,7 +33,6 @@ from service.cli.options import (
 )
 from service.cli.progress import Report, echo, progress_bar
 from service.client.errors import ServiceError
-from service.client.many import FOR_ALL, Outcome, deconvolve_many
 from service.client.operations import Operations
 from service.client.outputs import check_output_folder, check_outputs, written
 from service.start import STARTED
@@ -41,6 +40,7 @@ from workers.contract.requests import Deconvolve
 
 if TYPE_CHECKING:
     from psfcore.deconvolve.assess.pictures import Treated
+    from service.client.many import Outcome
 
 # Every field of the request is an option, except what the command fills in itself.
 _FILLED_IN = ("image_id", "psf_id", "changes_picture")
@@ -175,6 +175,8 @@ def _many(
     overwrite: bool,
 ) -> tuple[list[str], list[Outcome]]:
     """Deconvolve images into a folder; returns the lines to print, and the failures."""
+    from service.client.many import deconvolve_many
+
     outcomes = list(
         deconvolve_many(
             service,
@@ -262,6 +264,7 @@ def _one_by_one(
     the products to ``products``.
     """
     from psfcore.deconvolve.assess.pictures import changes_in_product
+    from service.client.many import FOR_ALL
 
     def one(name: str) -> Treated:
         with TemporaryDirectory(prefix="heliopsf-") as folder:

@@ -1,6 +1,7 @@
 """``heliopsf doctor``: checks in one command everything that an operator would check first.
 
-The command changes nothing. The command also works if no server and no worker run: a missing part is a finding.
+The command changes nothing, unless it is asked to compile the kernels. It also works if no server and no worker run: a
+missing part is a finding.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Literal, get_args
@@ -26,8 +27,8 @@ from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
 from psfcore import limited
-from psfcore.compiled import folder_of_kernels
 from psfcore.files import CACHE_VARIABLE
+from psfcore.kernel_files import FOLDER_VARIABLE, folder_of_kernels, private_folder
 from service.cli.operator import sentence
 from service.cli.options import DATA, read_settings
 from service.cli.progress import duration, echo
@@ -80,11 +81,14 @@ class Finding:
 @click.command()
 @DATA
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON")
-def doctor(data: Path | None, as_json: bool) -> None:
+@click.option(
+    "--compile", "compiles", is_flag=True, help="Compile all kernels, for all users; check nothing else"
+)
+def doctor(data: Path | None, as_json: bool, compiles: bool) -> None:
     """Check versions, settings, kernels, disk, database, broker and workers, and say what to do. If something is
     broken, the exit status is 1.
     """
-    findings = examine(read_settings(data))
+    findings = {"kernels": compiled_kernels()} if compiles else examine(read_settings(data))
     broken = any(finding.state == "broken" for finding in findings.values())
     if as_json:
         rows = [{"what": what, **asdict(finding)} for what, finding in findings.items()]
@@ -209,10 +213,27 @@ def kernels() -> Finding:
     folder, keeps = folder_of_kernels()
     if keeps:
         return Finding("ok", f"compiled kernels are kept in {folder}")
-    advice = f"set NUMBA_CACHE_DIR or {CACHE_VARIABLE} to a folder to which this user alone can write"
+    advice = f"set {FOLDER_VARIABLE} or {CACHE_VARIABLE} to a folder to which this user alone can write"
     return Finding(
         "warning", f"each process compiles its kernels again: they cannot be kept in {folder}", advice
     )
+
+
+def compiled_kernels() -> Finding:
+    """Compile the kernels that are not kept yet, with all cores. Can all users read them?"""
+    from psfcore.all_kernels import compile_all
+
+    folder, keeps = folder_of_kernels()
+    if not keeps:
+        return replace(kernels(), state="broken")
+    started = time.perf_counter()
+    new, kept = compile_all(cores())
+    took_s = time.perf_counter() - started
+    found = f"{new} kernels compiled in {took_s:.0f} s; {kept} are kept in {folder}"
+    if folder != private_folder():
+        return Finding("ok", found)
+    advice = f"run this command as the user who installed heliopsf, or set {FOLDER_VARIABLE} to a folder for all users"
+    return Finding("warning", f"{found}, which only this user uses", advice)
 
 
 def wall() -> Finding:

@@ -19,7 +19,6 @@ from tempfile import TemporaryDirectory
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from psfcore import limited
-from psfcore.compiled import listening
 from psfcore.deconvolve.box import Box
 from psfcore.deconvolve.declaration import KnownScene, check_stop
 from psfcore.deconvolve.forward import Convolved, convolve_image
@@ -35,7 +34,7 @@ from psfcore.fits.stored_psf import check_no_product
 from psfcore.gap.effect_sources import sha256_of_source
 from psfcore.instruments.unknown import unknown_instrument
 from psfcore.instruments.workload import check_workload
-from psfcore.transit.archive import list_archive, transit_in
+from psfcore.kernel_files import listening
 from service.cli.local_workspace import ImageFile, Inputs, LocalWorkspace, PsfFile, TransitFiles, states_of
 from service.client.answers import Ended, Json, Submitted, Uploaded
 from service.client.errors import ServiceError
@@ -106,6 +105,8 @@ class Local(Operations):
 
     def upload_transit(self, path: str | Path) -> Uploaded:
         """Add a transit, after the same check of its table of contents as in a service."""
+        from psfcore.transit.archive import list_archive, transit_in  # a deconvolution does not need it
+
         path = Path(path)
         if path.is_dir():
             path = path.resolve()

@@ -22,7 +22,6 @@ from psfcore.fits.psfs import read_psf
 from psfcore.instruments.unknown import channel_of
 from psfcore.psf import Psf
 from psfcore.psf_cache import built_file, kept_psf
-from psfcore.transit.archive import ArchiveContents, unpack
 from workers.contract.documents import header_json
 from workers.contract.identities import instrument_of_build, recipe_of
 from workers.contract.kinds import ResultType
@@ -40,6 +39,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from psfcore.recipe import Recipe
+    from psfcore.transit.archive import ArchiveContents
 
 
 States = dict[Path, tuple[int, int]]  # time of the last change (ns) and size (bytes) of the user's files
@@ -105,6 +105,8 @@ class TransitFiles:
             yield self.path
             check_unchanged(self.states)
             return
+        from psfcore.transit.archive import unpack
+
         with TemporaryDirectory(prefix="heliopsf-") as folder:
             unpack(self.path, folder, Settings.apart(Path(folder)).archive_limits)
             yield Path(folder)

@@ -96,7 +96,7 @@ class Runner:
 
     def _run(self, lease: Lease) -> None:
         # numba is imported only when a job runs, so that a process with a runner starts fast.
-        from psfcore.compiled import listening
+        from psfcore.kernel_files import listening
 
         job = self._catalogue.jobs.get(lease.job_id)
         if job is None:

@@ -244,7 +244,9 @@ def _holes(pair: Compared, noise_before: NoiseAt, least: float) -> Sign:
     def holes(rows: slice) -> Flags:
         before = pair.before[rows]
         found = pair.counted[rows] & (pair.after[rows] < HOLE_SHARE * before)
-        found &= before > 0.999 * DETECTION_SIGMA * least  # the noise of a pixel is rounded differently: the factor
+        found &= (
+            before > 0.999 * DETECTION_SIGMA * least
+        )  # the noise of a pixel is rounded differently: the factor
         y, x = _places(found)
         places = (y + rows.start, x)
         found[y, x] = pair.before[places] > DETECTION_SIGMA * noise_before(places)

@@ -49,7 +49,7 @@ from psfcore.convolution.engine import (
     rows_from_spectrum,
     rows_to_spectrum,
 )
-from psfcore.convolution.lanes import LANES
+from psfcore.convolution.lengths import LANES
 from psfcore.deconvolve.conditions import Deconvolved
 from psfcore.deconvolve.problem import (
     Iteration,

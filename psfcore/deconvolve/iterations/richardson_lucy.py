@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 
 from psfcore.compiled import compiled
 from psfcore.convolution.engine import Lines, Single, rows_from_spectrum, rows_to_spectrum
-from psfcore.convolution.lanes import LANES
+from psfcore.convolution.lengths import LANES
 from psfcore.deconvolve.problem import (
     Iteration,
     Judgement,

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import Convolver, linear_convolve
 from psfcore.convolution.engine import BLOCK_ROWS, Engine, Scratch
-from psfcore.convolution.fft_kernels import LANES, forward, inverse, make_plan
-from psfcore.convolution.lengths import good_length
+from psfcore.convolution.fft_kernels import forward, inverse, make_plan
+from psfcore.convolution.lengths import LANES, good_length
 from psfcore.errors import DataError
 from tests.psfcore.conftest import delta, gaussian
 

@@ -14,7 +14,7 @@ from numba.core.errors import TypingError
 from numpy.typing import NDArray
 
 from psfcore.convolution import lanes
-from psfcore.convolution.lanes import LANES
+from psfcore.convolution.lengths import LANES
 
 Single = NDArray[np.float32]
 

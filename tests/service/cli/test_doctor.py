@@ -106,6 +106,35 @@ def test_all_is_well_where_a_worker_is_there(catalogue: Catalogue, monkeypatch: 
 
 
 @pytest.mark.parametrize(
+    ("shared", "cache", "state", "folder"),
+    [
+        ("shared", "cache", "ok", "shared"),
+        (None, "cache", "warning", "cache"),  # only this user reads a private folder
+        (None, None, "broken", None),
+    ],
+)
+def test_it_compiles_the_kernels_and_says_where_they_are(
+    shared: str | None,
+    cache: str | None,
+    state: str,
+    folder: str | None,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name, place in (("NUMBA_CACHE_DIR", shared), ("HELIOPSF_CACHE_DIR", cache)):
+        monkeypatch.setenv(name, str(tmp_path / place if place else Path("/proc/nowhere")))
+    monkeypatch.setattr("psfcore.all_kernels.compile_all", lambda processes: (50, 55))
+    answer = ask("--compile", "--json")
+    (found,) = json.loads(answer.output)["findings"]
+    assert (found["what"], found["state"]) == ("kernels", state)
+    assert answer.exit_code == int(state == "broken") and ("NUMBA_CACHE_DIR" in found["advice"]) == (
+        state != "ok"
+    )
+    if folder is not None:
+        assert str(tmp_path / folder) in found["found"] and "50" in found["found"] and "55" in found["found"]
+
+
+@pytest.mark.parametrize(
     ("release", "advice"),
     [((3, 11, 9), "3.11.10"), ((3, 11, 10), ""), ((3, 12, 5), "3.12.6"), ((3, 12, 6), ""), ((3, 13, 0), "")],
 )

@@ -15,7 +15,7 @@ from workers.settings import Settings
 STOPS_WITHIN_S = 30.0
 _LIGHT = """
 import contextlib, sys, time, types
-sys.modules["psfcore.compiled"] = types.SimpleNamespace(listening=lambda report: contextlib.nullcontext())
+sys.modules["psfcore.kernel_files"] = types.SimpleNamespace(listening=lambda report: contextlib.nullcontext())
 import workers.run.runner
 workers.run.runner.load_tasks = lambda: None
 {task}

@@ -18,7 +18,7 @@ import pytest
 from sqlalchemy import select, text, update
 from sqlalchemy.exc import OperationalError
 
-from psfcore.compiled import KernelFiles, listening
+from psfcore.kernel_files import Kept, KernelFiles, listening
 from tests.workers.databases import BOTH, change, rows
 from tests.workers.jobs import Bench, claimed
 from tests.workers.run.processes import new_catalogue, started_worker, worker_of
@@ -149,16 +149,16 @@ def test_each_job_ends_once_although_a_worker_is_killed_and_the_others_leave(
 
 def test_a_job_that_compiles_says_so(tmp_path: Path, bench: Bench) -> None:
     """A kernel is compiled after its file was looked for in vain, and before its file is written."""
-    files = KernelFiles(str(tmp_path), "f.py311", "source")
+    files = KernelFiles((tmp_path,), "f", "source")
     stages: list[str] = []
 
     def task(context: CatalogueWorkspace, _: Mapping[str, Any]) -> str:
         context.report("reading", 0, 20)
         for _time in range(2):
-            if files.load(("float32",)) is None:
+            if files.load("float32") is None:
                 row = context.catalogue.jobs.get(context.job_id)
                 stages.append("" if row is None else row.stage)
-                files.save(("float32",), "code")
+                files.save("float32", Kept(None, b"code"))
             context.report("deconvolving", 1, 20)
         stages.extend(sorted(context.times.spent))
         return "0" * 64
@@ -168,14 +168,14 @@ def test_a_job_that_compiles_says_so(tmp_path: Path, bench: Bench) -> None:
 
 
 def test_only_the_thread_that_listens_is_told(tmp_path: Path) -> None:
-    files, told = KernelFiles(str(tmp_path), "f.py311", "source"), []
+    files, told = KernelFiles((tmp_path,), "f", "source"), []
     with listening(told.append):
-        other = Thread(target=lambda: files.load(("float64",)))
+        other = Thread(target=lambda: files.load("float64"))
         other.start()
         other.join()
         assert told == []
-        files.load(("float32",))
-        files.save(("float32",), "code")
-        assert files.load(("float32",)) == "code" and told == [False, True]
-    files.load(("float64",))
+        files.load("float32")
+        files.save("float32", Kept(None, b"code"))
+        assert files.load("float32") is not None and told == [False, True]
+    files.load("float64")
     assert told == [False, True]
