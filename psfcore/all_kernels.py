@@ -85,7 +85,7 @@ def _diffract() -> None:
 
 
 def _transform() -> None:
-    for length in (16, 32, 48, 64):  # 2 x 8, 4 x 8, 3 x 2 x 8, 8 x 8
+    for length in (16, 32, 48, 64, 80):  # 2 x 8, 4 x 8, 3 x 2 x 8, 8 x 8, 5 x 2 x 8
         make_plan(length)
 
 
