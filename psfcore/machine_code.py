@@ -120,18 +120,23 @@ class Linked:
 def _parts() -> dict[str, ModuleType]:
     """The extension modules of numba that machine code calls; LLVM knows their functions then.
 
-    Raises Unlinkable on other processors than x86-64, whose object code numba links in other ways.
+    Raises Unlinkable on other processors than x86-64, whose object code numba links in other ways, and if this version
+    of numba has other parts. numba itself then runs the kernels.
     """
     if platform.machine() not in ("x86_64", "AMD64"):
         raise Unlinkable(platform.machine())
     from llvmlite import binding
 
-    parts = {name: _extension(name) for name in _PARTS}
-    parts["core.runtime._nrt_python"].memsys_use_cpython_allocator()
+    try:
+        parts = {name: _extension(name) for name in _PARTS}
+        helpers = {name: parts[name].c_helpers for name in _PARTS}
+        parts["core.runtime._nrt_python"].memsys_use_cpython_allocator()
+    except (ImportError, OSError, AttributeError) as error:  # another version of numba may have other parts
+        raise Unlinkable(str(error)) from error
     binding.initialize_native_target()
     binding.initialize_native_asmprinter()
     for name, beginning in _PARTS.items():
-        for function, address in parts[name].c_helpers.items():
+        for function, address in helpers[name].items():
             binding.add_symbol(function if function.startswith("_") else beginning + function, address)
     # Machine code contains these objects, not the variables of C that point to them.
     binding.add_symbol("_Py_NoneStruct", id(None))
