@@ -134,9 +134,15 @@ class Engine:
         """The spectrum of the field, in blocks of columns. It must be asked for before threads share it."""
         return aligned(self.column_blocks, self.row_blocks * BLOCK_ROWS, 2, LANES)
 
+    @cached_property
+    def _whole(self) -> Single:
+        """The spectrum along both axes that `transform_columns` keeps."""
+        return aligned(self.column_blocks, self.column_plan.length, 2, LANES)
+
     def release(self) -> None:
-        """Give back the memory of the spectrum; the next transform takes it again."""
+        """Give back the memory of the spectra; the next transform takes it again."""
         self.__dict__.pop("_spectrum", None)
+        self.__dict__.pop("_whole", None)
 
     @property
     def nbytes(self) -> int:
@@ -153,13 +159,13 @@ class Engine:
 
     def apply(self, x: NDArray[np.floating]) -> Single:
         """The field [y, x] convolved with the PSF, H x."""
-        return self._whole(x, adjoint=False)
+        return self._operator(x, adjoint=False)
 
     def adjoint(self, y: NDArray[np.floating]) -> Single:
         """The field [y, x] correlated with the PSF, H^T y."""
-        return self._whole(y, adjoint=True)
+        return self._operator(y, adjoint=True)
 
-    def _whole(self, field: NDArray[np.floating], *, adjoint: bool) -> Single:
+    def _operator(self, field: NDArray[np.floating], *, adjoint: bool) -> Single:
         lanes = self.to_lanes(field)
         self.rows_forward(lanes)
         self.columns(adjoint=adjoint)
@@ -205,13 +211,17 @@ class Engine:
             first = n * BLOCK_ROWS
             yield first, lanes[n].transpose(1, 2, 0).reshape(BLOCK_ROWS, nx)[: ny - first]
 
-    def rows_forward(self, lanes: Single) -> None:
-        """Transform the rows of a field into the spectrum."""
-        self.row_stage(_rows_forward, lanes, 0)
+    def rows_forward(self, lanes: Single, first_block: int = 0) -> None:
+        """Transform the rows of a field, or of the blocks of a field from `first_block` on, into the spectrum."""
+        self._stage(_rows_forward, self.row_plan, len(lanes), lanes, first_block)
 
-    def rows_inverse(self, lanes: Single) -> None:
-        """Transform the spectrum's rows back into a field."""
-        self.row_stage(_rows_inverse, lanes)
+    def rows_inverse(self, lanes: Single, first_block: int = 0) -> None:
+        """Transform the spectrum's rows back into a field, or into its blocks from `first_block` on."""
+        self._stage(_rows_inverse, self.row_plan, len(lanes), lanes, first_block)
+
+    def rows_cut(self) -> None:
+        """As ``rows_inverse`` and ``rows_forward``: cut what the spectrum contains to the field. No field is written."""
+        self.row_stage(_rows_cut, self.field_shape[1], self.field_shape[0])
 
     def columns(self, *, adjoint: bool) -> None:
         """Transform the columns, multiply by the transfer function, and transform back.
@@ -234,6 +244,17 @@ class Engine:
             Whether to multiply by the complex conjugate of the filter.
         """
         self._stage(_columns, self.column_plan, self.column_blocks, transfer, conjugate)
+
+    def transform_columns(self) -> None:
+        """Transform the columns of the spectrum, and keep the result for `multiply_kept`."""
+        self._stage(_columns_forward, self.column_plan, self.column_blocks, self._whole)
+
+    def multiply_kept(self, transfer: Single) -> None:
+        """As ``multiply_columns``, but for the field whose columns `transform_columns` transformed last.
+
+        One transform of a field then serves for several filters.
+        """
+        self._stage(_columns_inverse, self.column_plan, self.column_blocks, self._whole, transfer)
 
     def row_stage(self, kernel: Callable[..., None], *fields: object) -> None:
         """Run the compiled row function of a method on all blocks: `kernel(lines, start, stop, *fields)`.
@@ -436,15 +457,42 @@ def _rows_forward(lines: Lines, start: int, stop: int, lanes: Single, first_bloc
 
 
 @compiled()
-def _rows_inverse(lines: Lines, start: int, stop: int, lanes: Single) -> None:
+def _rows_inverse(lines: Lines, start: int, stop: int, lanes: Single, first_block: int) -> None:
     for block in range(start, stop):
-        rows_from_spectrum(lines, block)
+        rows_from_spectrum(lines, first_block + block)
         _copy(lines.buffer, lanes[block].reshape(-1), lanes.shape[1] * _SIZE)
 
 
 @compiled()
+def _rows_cut(lines: Lines, start: int, stop: int, nx: int, ny: int) -> None:
+    for block in range(start, stop):
+        clear_beyond(rows_from_spectrum(lines, block), ny - block * BLOCK_ROWS, nx)
+        rows_to_spectrum(lines, block, nx)
+
+
+@compiled()
+def clear_beyond(z: Single, rows: int, nx: int) -> None:
+    """Set the rows of a block [x, half, lane] beyond the number of rows to 0."""
+    for row in range(max(rows, 0), BLOCK_ROWS):
+        for i in range(nx):
+            z[i, row // LANES, row % LANES] = np.float32(0.0)
+
+
+@compiled()
+def _multiply(buffer: Single, transfer: Single, group: int, length: int, conjugate: bool) -> None:
+    """Multiply transformed columns by the transfer function, real or complex, or by its conjugate."""
+    for k in range(length):
+        if transfer.shape[2] == 1:
+            scale(buffer, transfer, k * _SIZE, (group * length + k) * LANES)
+        elif conjugate:
+            turn_back(buffer, transfer, k * _SIZE, (group * length + k) * _SIZE)
+        else:
+            turn(buffer, transfer, k * _SIZE, (group * length + k) * _SIZE)
+
+
+@compiled()
 def _columns(lines: Lines, start: int, stop: int, transfer: Single, conjugate: bool) -> None:
-    """Multiply columns by the transfer function, real or complex, or by its conjugate."""
+    """Convolve columns."""
     buffer, length = lines.buffer, lines.plan.length
     # A block may have more rows than the transform; the rows beyond the transform are padding and stay zero.
     filled = min(lines.spectrum.shape[1], length) * _SIZE
@@ -453,12 +501,29 @@ def _columns(lines: Lines, start: int, stop: int, transfer: Single, conjugate: b
         _copy(column, buffer, filled)
         _clear(buffer, filled, length)
         forward(buffer, lines.plan)
-        for k in range(length):
-            if transfer.shape[2] == 1:
-                scale(buffer, transfer, k * _SIZE, (group * length + k) * LANES)
-            elif conjugate:
-                turn_back(buffer, transfer, k * _SIZE, (group * length + k) * _SIZE)
-            else:
-                turn(buffer, transfer, k * _SIZE, (group * length + k) * _SIZE)
+        _multiply(buffer, transfer, group, length, conjugate)
         inverse(buffer, lines.plan)
         _copy(buffer, column, filled)
+
+
+@compiled()
+def _columns_forward(lines: Lines, start: int, stop: int, whole: Single) -> None:
+    """The first half of `_columns`, into a spectrum along both axes."""
+    filled = min(lines.spectrum.shape[1], lines.plan.length) * _SIZE
+    for group in range(start, stop):
+        column = whole[group].reshape(-1)
+        _copy(lines.spectrum[group].reshape(-1), column, filled)
+        _clear(column, filled, lines.plan.length)
+        forward(column, lines.plan)
+
+
+@compiled()
+def _columns_inverse(lines: Lines, start: int, stop: int, whole: Single, transfer: Single) -> None:
+    """The second half of `_columns`, from a spectrum along both axes."""
+    buffer, length = lines.buffer, lines.plan.length
+    filled = min(lines.spectrum.shape[1], length) * _SIZE
+    for group in range(start, stop):
+        _copy(whole[group].reshape(-1), buffer, length * _SIZE)
+        _multiply(buffer, transfer, group, length, False)
+        inverse(buffer, lines.plan)
+        _copy(buffer, lines.spectrum[group].reshape(-1), filled)

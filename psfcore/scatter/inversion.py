@@ -36,6 +36,7 @@ Differences from the paper; the benefit of each was measured on simulated transi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -56,16 +57,25 @@ from psfcore.scatter.reconstruction import (
     on_threads,
 )
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Shape
-from psfcore.scatter.total_psf import Blur, Optics, TotalPsf, noise_covariance
+from psfcore.scatter.total_psf import (
+    NOISE_REACH_PX,
+    Blur,
+    Optics,
+    TotalPsf,
+    around_disc,
+    noise_covariance,
+)
 from psfcore.transit.transit import Transit
 
-ALGORITHM_VERSION = 2  # of `invert`: a change of its results needs a new number, because solutions are kept
+ALGORITHM_VERSION = 3  # of `invert`: a change of its results needs a new number, because solutions are kept
 PILOT_FRAMES = 16
-PILOT_CONVERGED_POINTS = 0.3
+# If C(R) changes by less than this in a Gauss-Newton step, the next step changes it by about a fifteenth.
+NEARLY_CONVERGED_POINTS = 1.0
+NEAR_POINTS = 0.3
 CONVERGED_POINTS = 0.02  # limit for the change of C(R), in percentage points: a tenth of the allowed bias
 ROUNDS = 12
 WARM_STEPS = 3
-SLOPES_KEPT_BELOW_POINTS = 0.3
+SLOPES_KEPT_BELOW_POINTS = 1.0
 LEAST_FRAMES = 3
 WEAKEST_DIRECTION = 1e-10  # smallest allowed eigenvalue of the normal matrix, after scaling its diagonal to 1
 
@@ -112,13 +122,13 @@ def invert(
     frames = solver.taking_part()
     if near:
         at = solver.solve(at, frames, CONVERGED_POINTS)
-        if solver.converged and solver.moved_points < PILOT_CONVERGED_POINTS:
+        if solver.converged and solver.moved_points < NEAR_POINTS:
             return solver.solution(at)
     else:
         if len(frames) > PILOT_FRAMES + LEAST_FRAMES:
             spread = np.unique(np.linspace(0, len(frames) - 1, PILOT_FRAMES).round().astype(int))
-            at = solver.solve(at, [frames[k] for k in spread], PILOT_CONVERGED_POINTS)
-        at = solver.solve(at, frames, PILOT_CONVERGED_POINTS)
+            at = solver.solve(at, [frames[k] for k in spread], NEARLY_CONVERGED_POINTS)
+        at = solver.solve(at, frames, NEARLY_CONVERGED_POINTS)
     kernel = total.kernel(at)  # repeat step (e) with a PSF that is nearly correct
     sky.find(Optics(kernel, transit.shape, threads=threads), kernel)
     at = solver.solve(at, solver.taking_part(), CONVERGED_POINTS)
@@ -245,17 +255,14 @@ class _Model:
     """The images with the PSF at given coordinates, and the derivatives of this PSF."""
 
     images: Reconstruction
+    kernel: Kernel
     slope_blurs: list[Blur]
     curve: Vector
     curve_slopes: Matrix
 
     def twins(self) -> list[_Model]:
         """The same for each thread, see `on_threads`."""
-        blurs = [blur.twins() for blur in self.slope_blurs]
-        return [
-            replace(self, images=images, slope_blurs=[of_all[k] for of_all in blurs])
-            for k, images in enumerate(self.images.twins())
-        ]
+        return [replace(self, images=images) for images in self.images.twins()]
 
 
 class _Solver:
@@ -358,6 +365,7 @@ class _Solver:
         slopes = self._total.slopes(at)
         return _Model(
             images=self.reconstruction(kernel, frames),
+            kernel=kernel,
             slope_blurs=[Blur(s, shape, threads=threads) for s in slopes] if with_slopes else [],
             curve=cumulative_curve(kernel, self._total.radii_px),
             curve_slopes=self._total.curve_slopes(slopes),
@@ -378,12 +386,12 @@ class _Solver:
         and (4).
         """
         images = model.images
-        self._sky.improve(n, images.optics, WARM_STEPS)  # step (d)
-        residual, expected = images.residual(n)  # step (f)
+        scene = self._sky.improve(n, images.optics, WARM_STEPS)  # step (d)
+        slopes = model.slope_blurs if kept is None else ()
+        residual, expected, jacobian = images.residual_with_jacobian(n, slopes, scene)  # step (f)
         if kept is not None:
             return replace(kept, residual=residual, expected=expected)
         weight = images.weight(n, expected)
-        jacobian = np.array([images.jacobian(n, blur) for blur in model.slope_blurs])
         weighted = jacobian * weight
         return _Measured(residual, expected, weight, weighted, weighted @ jacobian.T)
 
@@ -396,17 +404,19 @@ class _Solver:
         spread = np.zeros_like(normal)
         fits = []
 
+        kernel, field = model.kernel, self._sky.transit.shape
+        reach = NOISE_REACH_PX + max(frame.place.radius_px for frame in self._sky.transit.frames)
+        part = (min(field[0], math.ceil(2 * reach)), min(field[1], math.ceil(2 * reach)))
+        near = Optics(kernel, part, threads=self._threads)
+
         def covariance_of(optics: Optics, n: int) -> Matrix:
-            frame, dark, noise = self._sky.transit.frames[n], self._sky.dark[n], self._sky.transit.noise
+            frame, dark = around_disc(self._sky.transit.frames[n], self._sky.dark[n], part)
             templates = [*measured[n].weighted, np.full(dark[0].size, 1 / dark[0].size)]
-            # The covariance of the score, and in the last row that of the mean residual, from the noise of all pixels.
-            return noise_covariance(optics, frame, dark, templates, noise)
+            # The covariance of the score, and in the last row that of the mean residual, from the noise of the pixels.
+            return noise_covariance(optics, frame, dark, templates, self._sky.transit.noise)
 
         covariances = on_threads(
-            covariance_of,
-            frames,
-            model.images.optics.twins(),
-            lambda step: self._progress("errors", step, len(frames)),
+            covariance_of, frames, near.twins(), lambda step: self._progress("errors", step, len(frames))
         )
         for (n, m), of_noise in zip(measured.items(), covariances, strict=True):
             frame, dark = self._sky.transit.frames[n], self._sky.dark[n]
@@ -423,7 +433,7 @@ class _Solver:
                     chi2=m.chi2,
                     normal=m.normal,
                     score=m.score,
-                    mean_jacobian=(m.weighted / m.weight).mean(axis=1),
+                    jacobian=m.weighted / m.weight,
                 )
             )
         inverse = np.linalg.inv(normal)

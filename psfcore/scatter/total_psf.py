@@ -26,6 +26,12 @@ residual in the disc is then r = D [y - H (1 - D) G y]. The sum of the residual 
     t . r = b . n + (t . r without noise),   b = t - G^T (1 - D) H^T t                Eq. (3)
     cov(t_1 . r, t_2 . r) = sum over all pixels of b_1 b_2 var(n)                     Eq. (4)
 
+If the PSF changes, the expected light P H x in dark pixels P of a scene x that is 0 there changes as
+
+    P [1 - H (1 - P) G] (dH / dq) x                                                   Eq. (5)
+
+The second term of Eq. (5) is the change of the estimated scene, by Eq. (2).
+
 The first term of b describes the noise of the disc's pixels. The second term describes the noise of the estimated
 scene, which the model scatters into the disc.
 
@@ -55,18 +61,28 @@ from psfcore.convolution.convolver import Convolver
 from psfcore.convolution.engine import BLOCK_ROWS, Engine
 from psfcore.convolution.lanes import LANES
 from psfcore.deconvolve.assess.error_planes import sigma_points
-from psfcore.deconvolve.iterations.linear import inverse_filter, solve_linear, transfer_sample
+from psfcore.deconvolve.iterations.linear import (
+    LEAST_TRANSFER,
+    inverse_filter,
+    solve_linear,
+    transfer_sample,
+)
 from psfcore.errors import DataError
 from psfcore.noise import Noise
 from psfcore.psf import CURVE_RADII_PX, REACH_GRID_PX, FittedShape, Psf, encircled_energy
 from psfcore.psf_sampling import psf_for_image
 from psfcore.scatter.shapes import Shape, shape_named
-from psfcore.transit.transit import Frame
+from psfcore.transit.transit import Frame, Place
 
 DIFFRACTION, SCATTER = "DIFFRACTION", "SCATTER"
 Lanes = NDArray[np.float32]
 Pixels = tuple[NDArray[np.intp], NDArray[np.intp]]  # (rows, columns) of single pixels
 STEPS = 5
+# A step that changes a scene by less than this fraction (rms) leaves an error about a hundred times smaller, which is the
+# rounding of float32 in the dark pixels. This holds for a PSF with at least LEAST_TRANSFER at all frequencies.
+SETTLED = 1e-3
+# Noise beyond this distance from a disc adds less than 1e-5 to the variance of sums over the disc.
+NOISE_REACH_PX = 200
 BLOCK_PX = 2**18  # of sums over all pixels: arrays of this size need little memory
 
 
@@ -210,11 +226,16 @@ class Blur:
         return self._through(lanes, self.engine.transfer, conjugate=True)
 
     def _through(self, lanes: Lanes, transfer: NDArray[np.float32], *, conjugate: bool = False) -> Lanes:
-        out = np.empty(self.engine.lanes_shape, np.float32)
         self.engine.rows_forward(lanes)
         self.engine.multiply_columns(transfer, conjugate=conjugate)
-        self.engine.rows_inverse(out)
-        if self._partly_filled:  # the last block also contains rows beyond the field; the field is dark there
+        return self._rows(0, self.engine.row_blocks)
+
+    def _rows(self, first: int, stop: int) -> Lanes:
+        """The field that the engine's spectrum contains, or some of its blocks of rows."""
+        out = np.empty((stop - first, *self.engine.lanes_shape[1:]), np.float32)
+        self.engine.rows_inverse(out, first)
+        if self._partly_filled and stop == self.engine.row_blocks:
+            # The last block also contains rows beyond the field; the field is dark there.
             rows = self.engine.field_shape[0] % BLOCK_ROWS
             out[-1, :, 0, min(rows, LANES) :] = 0.0
             out[-1, :, 1, max(rows - LANES, 0) :] = 0.0
@@ -251,7 +272,45 @@ class Optics(Blur):
             First estimate; default: the observation.
         """
         first = observed if start is None else start
-        return solve_linear(self.engine, self._inverse, observed, first, steps)  # Eq. (1)
+        settled = SETTLED if self.least_transfer >= LEAST_TRANSFER else 0.0
+        return solve_linear(self.engine, self._inverse, observed, first, steps, settled=settled)  # Eq. (1)
+
+    def light_in(self, pixels: Pixels, scene: Lanes, slopes: Sequence[Blur] = ()) -> tuple[Vector, Matrix]:
+        """The light that a scene scatters into single pixels, and how it changes with the PSF, Eq. (5).
+
+        The result is that of `convolve` and `invert_once` one after the other, but the scene is transformed only once, and
+        fields are not written to memory. The derivatives have the shape (slopes, pixels).
+
+        Parameters
+        ----------
+        scene
+            The scene; it is 0 in the pixels.
+        slopes
+            Derivatives of the PSF, on an array of its size and for fields of the same shape.
+        """
+        engine = self.engine
+        if any(slope.engine.transfer.shape[:2] != engine.transfer.shape[:2] for slope in slopes):
+            raise ValueError("expected derivatives for the same fields, on an array of the size of the PSF")
+        blocks = pixels[0] // BLOCK_ROWS
+        first, stop = (int(blocks.min()), int(blocks.max()) + 1) if blocks.size else (0, 1)
+        here = pixels[0] - first * BLOCK_ROWS, pixels[1]
+        engine.rows_forward(scene)
+        engine.transform_columns()
+        engine.multiply_kept(engine.transfer)
+        light = pick(self._rows(first, stop), here)
+        responses = np.empty((len(slopes), light.size))
+        for response, slope in zip(responses, slopes, strict=True):
+            engine.multiply_kept(slope.engine.transfer)
+            response[:] = pick(self._rows(first, stop), here)
+            engine.rows_cut()
+            engine.multiply_columns(self._inverse)
+            around = self._rows(first, stop)
+            put(around, here, 0.0)
+            engine.rows_cut()
+            engine.rows_forward(around, first)
+            engine.multiply_columns(engine.transfer)
+            response -= pick(self._rows(first, stop), here)
+        return light, responses
 
 
 def pick(lanes: Lanes, pixels: Pixels) -> Vector:
@@ -267,6 +326,23 @@ def put(lanes: Lanes, pixels: Pixels, values: NDArray[np.floating] | float) -> N
 def _index(pixels: Pixels) -> tuple[NDArray[np.intp], ...]:
     rows, columns = pixels
     return rows // BLOCK_ROWS, columns, rows % BLOCK_ROWS // LANES, rows % LANES
+
+
+def around_disc(frame: Frame, dark: Pixels, shape: tuple[int, int]) -> tuple[Frame, Pixels]:
+    """The part of a frame around its dark pixels, inside the field; also these pixels in this part.
+
+    Parameters
+    ----------
+    shape
+        Shape (ny, nx) of the part, at most that of the frame.
+    """
+    y, x = (
+        int(np.clip(round(float(of_axis.mean())) - size // 2, 0, whole - size))
+        for of_axis, size, whole in zip(dark, shape, frame.pixels.shape, strict=True)
+    )
+    place = Place(frame.place.x_px - x, frame.place.y_px - y, frame.place.radius_px)
+    pixels = frame.pixels[y : y + shape[0], x : x + shape[1]]
+    return replace(frame, pixels=pixels, place=place, filled=None), (dark[0] - y, dark[1] - x)
 
 
 def noise_covariance(

@@ -27,6 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +63,12 @@ DECONVOLUTION_NOISE = 2.3  # factor by which a deconvolution increases noise, fo
 LEAST_LEVEL = 1e-6
 _STRIPS = 32
 _DIFFERENCE_PX = 0.05
+
+
+class Windowed(Protocol):
+    """An array [y, x] of which windows can be read."""
+
+    def __getitem__(self, window: Window, /) -> NDArray[np.float32]: ...
 
 
 @dataclass(frozen=True)
@@ -178,7 +185,7 @@ def neighbours_of(index: int, frames: Sequence[Frame], places: Sequence[Place], 
 def find_occulter(
     index: int,
     frames: Sequence[Frame],
-    scene_of: Callable[[int], NDArray[np.float32]],
+    scene_of: Callable[[int], Windowed],
     places: Sequence[Place],
     psf_kernel: Plane,
     noise: Noise,
@@ -188,7 +195,7 @@ def find_occulter(
     Parameters
     ----------
     scene_of
-        Function of the index of a frame that returns the deconvolved frame [y, x], DN/s.
+        Function of the index of a frame that returns the deconvolved frame [y, x], DN/s; only a window of it is read.
     places
         The best known positions of the occulter in all frames; they decide which frames are neighbours.
     psf_kernel

@@ -195,7 +195,7 @@ def compare_shapes(
     shapes = [shape for shape in SHAPES.values() if shape.name != base.name]
     at, field_shape, threads = solution.inversion, solution.transit.shape, solution.threads
     names: list[str] = []
-    blurs = [Blur(slope, field_shape, threads=threads) for slope in solution.total.slopes(at.coordinates)]
+    blurs = []
     for shape in shapes:  # derivatives of the total PSF, at the solution of the power law
         total = TotalPsf(solution.transit.diffraction, shape, field_shape, threads=threads)
         for k, parameter in enumerate(shape.parameters[BASE:], start=BASE):
@@ -203,18 +203,17 @@ def compare_shapes(
                 names.append(parameter.name)
                 slope = total.slope(shape.coordinates(at.values), k)
                 blurs.append(Blur(slope, field_shape, threads=threads))
+    base_jacobians = {n: frame.jacobian for n, frame in zip(solution.part, at.frames, strict=True)}
 
-    def equations(tool: tuple[Solution, list[Blur]], n: int) -> tuple[Matrix, Matrix]:
-        solution, blurs = tool
-        residual, expected = solution.residual(n)
-        jacobian = np.array([solution.jacobian(n, blur) for blur in blurs])
+    def equations(solution: Solution, n: int) -> tuple[Matrix, Matrix]:
+        residual, expected, added = solution.residual_with_jacobian(n, blurs)
+        jacobian = np.concatenate((base_jacobians[n], added))
         weighted = jacobian * solution.weight(n, expected)
         return weighted @ jacobian.T, weighted @ residual
 
-    tools = list(zip(solution.twins(), map(list, zip(*(b.twins() for b in blurs), strict=True)), strict=True))
     count = len(solution.part)
     found = on_threads(
-        equations, solution.part, tools, lambda step: progress("comparing shapes", step, count)
+        equations, solution.part, solution.twins(), lambda step: progress("comparing shapes", step, count)
     )
     normal, score = (np.array(part) for part in zip(*found, strict=True))
     added = [[BASE + names.index(name) for name in shape.names[BASE:]] for shape in shapes]
