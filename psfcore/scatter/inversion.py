@@ -69,13 +69,13 @@ from psfcore.transit.transit import Transit
 
 ALGORITHM_VERSION = 3  # of `invert`: a change of its results needs a new number, because solutions are kept
 PILOT_FRAMES = 16
-# If C(R) changes by less than this in a Gauss-Newton step, the next step changes it by about a fifteenth.
-NEARLY_CONVERGED_POINTS = 1.0
-NEAR_POINTS = 0.3
+PILOT_CONVERGED_POINTS = 0.3
 CONVERGED_POINTS = 0.02  # limit for the change of C(R), in percentage points: a tenth of the allowed bias
 ROUNDS = 12
 WARM_STEPS = 3
-SLOPES_KEPT_BELOW_POINTS = 1.0
+# The Jacobian is kept while C(R) changes by less than this multiple of the tolerance. A Jacobian of another PSF moves the
+# minimum by the relative error of the Jacobian times the standard error of the fit.
+SLOPES_KEPT_TOLERANCES = 3.0
 LEAST_FRAMES = 3
 WEAKEST_DIRECTION = 1e-10  # smallest allowed eigenvalue of the normal matrix, after scaling its diagonal to 1
 
@@ -122,13 +122,13 @@ def invert(
     frames = solver.taking_part()
     if near:
         at = solver.solve(at, frames, CONVERGED_POINTS)
-        if solver.converged and solver.moved_points < NEAR_POINTS:
+        if solver.converged and solver.moved_points < PILOT_CONVERGED_POINTS:
             return solver.solution(at)
     else:
         if len(frames) > PILOT_FRAMES + LEAST_FRAMES:
             spread = np.unique(np.linspace(0, len(frames) - 1, PILOT_FRAMES).round().astype(int))
-            at = solver.solve(at, [frames[k] for k in spread], NEARLY_CONVERGED_POINTS)
-        at = solver.solve(at, frames, NEARLY_CONVERGED_POINTS)
+            at = solver.solve(at, [frames[k] for k in spread], PILOT_CONVERGED_POINTS)
+        at = solver.solve(at, frames, PILOT_CONVERGED_POINTS)
     kernel = total.kernel(at)  # repeat step (e) with a PSF that is nearly correct
     sky.find(Optics(kernel, transit.shape, threads=threads), kernel)
     at = solver.solve(at, solver.taking_part(), CONVERGED_POINTS)
@@ -306,7 +306,7 @@ class _Solver:
         moved, self.converged = np.inf, False
         before: tuple[Vector, float] | None = None
         for _ in range(ROUNDS):
-            if moved > SLOPES_KEPT_BELOW_POINTS or not kept:
+            if moved > SLOPES_KEPT_TOLERANCES * tolerance_points:
                 kept = {}
             model = self._model(at, frames, with_slopes=not kept)
             measured = kept = self._measure(model, frames, kept)
