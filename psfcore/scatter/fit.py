@@ -51,14 +51,13 @@ from psfcore.scatter.as_published import (
     invert_as_published,
 )
 from psfcore.scatter.inversion import Inverter, solution_of
-from psfcore.scatter.reconstruction import Inversion, Progress, Solution
+from psfcore.scatter.reconstruction import Inversion, Progress, Solution, on_threads
 from psfcore.scatter.segments import Segments, beyond_pct, segment_sums, shells_as_published
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW, shape_named, stretch_of
 from psfcore.scatter.total_psf import Blur, curve_sigma, pick
 from psfcore.scatter.validation.cross_validation import LIMITS, limits_json
 from psfcore.scatter.validation.robustness import ComparedShape, compare_shapes
 from psfcore.transit.first_guess import FirstGuess, first_guess
-from psfcore.transit.occulter import disc_distance
 from psfcore.transit.transit import Transit
 
 RADII_PX = (*CURVE_RADII_PX, 500.0, 1000.0)
@@ -189,7 +188,7 @@ def fit_transit(
     """
     form = shape_named(shape)
     power_law = form is SOFTENED_POWER_LAW
-    guess = first_guess(transit)
+    guess = first_guess(transit, threads=threads)
     progress = _FitProgress(
         progress,
         len(transit.frames),
@@ -292,25 +291,24 @@ def _free_shells(solution: Solution, seed: int, progress: Progress) -> ShellWeig
     """
     segments = Segments(shells_as_published())
     diffract = Blur(solution.transit.diffraction, solution.transit.shape, threads=solution.threads)
-    parts = []
-    for step, n in enumerate(solution.part):
-        progress("free shells", step, len(solution.part))
-        frame, dark = solution.transit.frames[n], solution.sky.dark[n]
-        blanked = solution.blanked_scene(n)
-        diffracted = diffract.convolve(blanked)
-        expected = pick(solution.optics.convolve(blanked), dark)
-        distance = disc_distance(solution.transit.shape, solution.sky.found[n].place)[dark]
-        parts.append(
-            Equations(
-                observed=solution.observed(n),
-                ring_sums=segment_sums(
-                    diffract.field(diffracted), np.stack(dark, axis=1), segments, threads=solution.threads
-                ),
-                unscattered=pick(diffracted, dark),
-                scale=1 / np.sqrt(solution.weight(n, expected)),
-                stratum=np.maximum(np.floor(frame.place.radius_px - distance), 0).astype(np.int64),
-            )
+
+    def equations(tool: tuple[Solution, Blur], n: int) -> Equations:
+        solution, diffract = tool
+        frame, dark, place = solution.transit.frames[n], solution.sky.dark[n], solution.sky.found[n].place
+        _, expected = solution.residual(n)
+        diffracted = diffract.convolve(solution.blanked_scene(n))
+        distance = np.hypot(dark[0] - place.y_px, dark[1] - place.x_px)
+        return Equations(
+            observed=solution.observed(n),
+            ring_sums=segment_sums(diffract.field(diffracted), np.stack(dark, axis=1), segments),
+            unscattered=pick(diffracted, dark),
+            scale=1 / np.sqrt(solution.weight(n, expected)),
+            stratum=np.maximum(np.floor(frame.place.radius_px - distance), 0).astype(np.int64),
         )
+
+    count = len(solution.part)
+    tools = list(zip(solution.twins(), diffract.twins(), strict=True))
+    parts = on_threads(equations, solution.part, tools, lambda step: progress("free shells", step, count))
     shape, at = solution.inversion.shape, solution.inversion.coordinates
     towards = segments.mean_of_map(shape.kernel(at, REACH_GRID_PX))
     counts = segments.counts.astype(np.float64)

@@ -41,12 +41,17 @@ class StoredScene:
         mantissa, exponent = math.frexp(max(float(lanes.max()), -float(lanes.min())))
         # A maximum that is rounded up to a power of two has the exponent that it will have when it is stored again.
         exponent += int(np.float16(mantissa) == 1) - _LARGEST_EXPONENT
-        return cls((lanes * np.float32(2.0**-exponent)).astype(np.float16), exponent)
+        factor, values = np.float32(2.0**-exponent), np.empty(lanes.shape, np.float16)
+        for block, stored in zip(lanes, values, strict=True):  # a block stays in the cache
+            stored[:] = block * factor
+        return cls(values, exponent)
 
     def lanes(self, blocks: slice = slice(None)) -> Lanes:
         """The scene, or some of its blocks of rows."""
-        lanes = self.values[blocks].astype(np.float32)
-        lanes *= np.float32(2.0**self.exponent)
+        values, factor = self.values[blocks], np.float32(2.0**self.exponent)
+        lanes = np.empty(values.shape, np.float32)
+        for block, stored in zip(lanes, values, strict=True):
+            np.multiply(stored, factor, out=block)
         return lanes
 
     def __getitem__(self, window: tuple[slice, slice]) -> NDArray[np.float32]:

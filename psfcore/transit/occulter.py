@@ -129,9 +129,12 @@ def coverage(shape: tuple[int, int], place: Place) -> Plane:
 
 def fully_dark(shape: tuple[int, int], place: Place, margin_px: float = 0.0) -> NDArray[np.bool_]:
     """True for pixels [y, x] whose farthest corner is inside the disc by at least margin_px."""
-    y = np.abs(np.arange(shape[0]) - place.y_px)[:, None] + 0.5
-    x = np.abs(np.arange(shape[1]) - place.x_px)[None, :] + 0.5
-    return np.asarray(np.hypot(y, x) <= place.radius_px - margin_px)
+    rows, columns = patch_window(shape, place, max(-margin_px, 0.0))  # no pixel outside this window is inside
+    y = np.abs(np.arange(rows.start, rows.stop) - place.y_px)[:, None] + 0.5
+    x = np.abs(np.arange(columns.start, columns.stop) - place.x_px)[None, :] + 0.5
+    dark = np.zeros(shape, dtype=bool)
+    dark[rows, columns] = np.hypot(y, x) <= place.radius_px - margin_px
+    return dark
 
 
 def disc_distance(shape: tuple[int, int], place: Place) -> Plane:
