@@ -127,6 +127,8 @@ class Engine:
         twin = copy.copy(self)
         twin.release()
         twin._use_threads(1)
+        # Taken here, because memory that many threads take and give back is left in pieces that are not used again.
+        _ = twin._spectrum
         return twin
 
     @cached_property
@@ -174,21 +176,29 @@ class Engine:
 
     # Steps that a method combines -------------------------------------------------------------------
 
-    def to_lanes(self, field: NDArray[np.floating], *, padding: float = 0.0) -> Single:
-        """Convert a field (ny, nx) to the engine's layout. Additional rows that complete the last block hold
-        `padding`.
+    def to_lanes(
+        self, field: NDArray[np.floating], *, padding: float = 0.0, out: Single | None = None
+    ) -> Single:
+        """Convert a field (ny, nx) to the engine's layout, into `out` if it is given. Additional rows that complete the
+        last block hold `padding`.
         """
         if field.shape != self.field_shape:
             raise DataError("field-shape", f"expected a field of {self.field_shape}; got {field.shape}")
-        return self.lanes_of(lambda rows: field[rows], padding=padding)
+        return self.lanes_of(lambda rows: field[rows], padding=padding, out=out)
 
-    def lanes_of(self, rows_of: Callable[[slice], NDArray[np.floating]], *, padding: float = 0.0) -> Single:
+    def lanes_of(
+        self,
+        rows_of: Callable[[slice], NDArray[np.floating]],
+        *,
+        padding: float = 0.0,
+        out: Single | None = None,
+    ) -> Single:
         """As ``to_lanes``, for a field that is computed in blocks of rows: `rows_of(rows)` returns these rows.
 
         The whole field is never in memory.
         """
         ny, nx = self.field_shape
-        lanes = aligned(*self.lanes_shape)
+        lanes = aligned(*self.lanes_shape) if out is None else out
         block = np.empty((BLOCK_ROWS, nx), np.float32)
         for n in range(self.row_blocks):
             rows = slice(n * BLOCK_ROWS, min((n + 1) * BLOCK_ROWS, ny))
@@ -220,7 +230,9 @@ class Engine:
         self._stage(_rows_inverse, self.row_plan, len(lanes), lanes, first_block)
 
     def rows_cut(self) -> None:
-        """As ``rows_inverse`` and ``rows_forward``: cut what the spectrum contains to the field. No field is written."""
+        """As ``rows_inverse`` and ``rows_forward``, without a field in memory: cut what the spectrum contains to the
+        field.
+        """
         self.row_stage(_rows_cut, self.field_shape[1], self.field_shape[0])
 
     def columns(self, *, adjoint: bool) -> None:

@@ -32,7 +32,6 @@ from typing import ClassVar
 import numpy as np
 
 from psfcore.arrays import Kernel, Matrix, Vector, json_attributes
-from psfcore.convolution.convolver import Convolver
 from psfcore.deconvolve.iterations.linear import LEAST_TRANSFER
 from psfcore.psf import (
     CURVE_RADII_PX,
@@ -54,7 +53,7 @@ from psfcore.scatter.inversion import Inverter, solution_of
 from psfcore.scatter.reconstruction import Inversion, Progress, Solution, on_threads
 from psfcore.scatter.segments import Segments, beyond_pct, segment_sums, shells_as_published
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW, shape_named, stretch_of
-from psfcore.scatter.total_psf import Blur, curve_sigma, pick
+from psfcore.scatter.total_psf import Blur, TotalPsf, curve_sigma, pick
 from psfcore.scatter.validation.cross_validation import LIMITS, limits_json
 from psfcore.scatter.validation.robustness import ComparedShape, compare_shapes
 from psfcore.transit.first_guess import FirstGuess, first_guess
@@ -197,9 +196,9 @@ def fit_transit(
     )
     solution = solution_of(transit, form, solution, threads=threads, progress=progress)
     factor = overdispersion(solution.inversion)
-    kernel, scatter, curve, diffuse = _on_full_reach(solution, factor, threads)
     free = _free_shells(solution, seed, progress) if form.isotropic else None
     shapes = compare_shapes(solution, progress=progress) if power_law else ()
+    kernel, scatter, curve, diffuse = _on_full_reach(solution, factor, threads)
     invert_at = partial(invert_as_published, transit, seed=seed, threads=threads, progress=progress)
     published, alone = None, {}
     if as_published:
@@ -264,21 +263,21 @@ def overdispersion(inversion: Inversion) -> float:
 
 def _on_full_reach(solution: Solution, factor: float, threads: int) -> tuple[Kernel, Kernel, Curve, Curve]:
     """Total PSF and scatter kernel [y, x] on the full reach, and C(R) of both with errors."""
-    inversion = solution.inversion
-    shape, at = inversion.shape, inversion.coordinates
-    radii = np.array(RADII_PX)
-    grid = (REACH_GRID_PX, REACH_GRID_PX)
-    diffract = Convolver(solution.transit.diffraction, grid, dtype=np.float64, threads=threads)
+    shape, at = solution.inversion.shape, solution.inversion.coordinates
+    radii, field = np.array(RADII_PX), (REACH_GRID_PX, REACH_GRID_PX)
+    total = solution.total
+    if total.size < REACH_GRID_PX:
+        total = TotalPsf(solution.transit.diffraction, shape, field, threads=threads)
     scatter = shape.kernel(at, REACH_GRID_PX)
-    kernel = np.maximum(diffract.apply(scatter), 0.0)
-    # Single precision is sufficient for the derivatives and takes half the time.
-    diffract = Convolver(solution.transit.diffraction, grid, dtype=np.float32, threads=threads)
-    diffuse_slopes = [shape.slope(at, k, REACH_GRID_PX) for k in range(at.size)]
-    total_slopes = (np.asarray(diffract.apply(slope), np.float64) for slope in diffuse_slopes)
+    kernel = np.maximum(total.diffracted(scatter), 0.0)
+    total_slopes = (total.slope(at, k) for k in range(at.size))
+    diffuse_slopes = (shape.slope(at, k, REACH_GRID_PX) for k in range(at.size))
 
     def curve(of: Kernel, slopes: Iterable[Kernel]) -> Curve:
         return Curve(
-            radii, cumulative_curve(of, radii), curve_sigma(slopes, inversion.covariance * factor, radii)
+            radii,
+            cumulative_curve(of, radii),
+            curve_sigma(slopes, solution.inversion.covariance * factor, radii),
         )
 
     return kernel, scatter, curve(kernel, total_slopes), curve(scatter, diffuse_slopes)

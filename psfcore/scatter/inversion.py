@@ -73,8 +73,8 @@ PILOT_CONVERGED_POINTS = 0.3
 CONVERGED_POINTS = 0.02  # limit for the change of C(R), in percentage points: a tenth of the allowed bias
 ROUNDS = 12
 WARM_STEPS = 3
-# The Jacobian is kept while C(R) changes by less than this multiple of the tolerance. A Jacobian of another PSF moves the
-# minimum by the relative error of the Jacobian times the standard error of the fit.
+# The Jacobian is kept while C(R) changes by less than this multiple of the tolerance. A Jacobian of another PSF moves
+# the minimum by the relative error of the Jacobian times the standard error of the fit.
 SLOPES_KEPT_TOLERANCES = 3.0
 LEAST_FRAMES = 3
 WEAKEST_DIRECTION = 1e-10  # smallest allowed eigenvalue of the normal matrix, after scaling its diagonal to 1
@@ -303,12 +303,14 @@ class _Solver:
     def solve(self, at: Vector, frames: list[int], tolerance_points: float) -> Vector:
         """Iterate until C(R) changes by less than the tolerance in one round. Return the coordinates."""
         kept: dict[int, _Measured] = {}
+        curve_slopes = np.zeros((0, at.size))
         moved, self.converged = np.inf, False
         before: tuple[Vector, float] | None = None
         for _ in range(ROUNDS):
             if moved > SLOPES_KEPT_TOLERANCES * tolerance_points:
                 kept = {}
             model = self._model(at, frames, with_slopes=not kept)
+            curve_slopes = curve_slopes if kept else model.curve_slopes
             measured = kept = self._measure(model, frames, kept)
             chi2 = sum(self._counts[n] * m.chi2 for n, m in measured.items())
             if before is not None and chi2 > 1.2 * before[1]:
@@ -316,7 +318,7 @@ class _Solver:
                 continue
             before = (at, chi2)
             step, whole = self._step(measured)
-            moved = float(np.abs(model.curve_slopes @ step).max())
+            moved = float(np.abs(curve_slopes @ step).max())
             pixels = sum(self._counts[n] * m.residual.size for n, m in measured.items())
             self.rounds.append(
                 Round(
@@ -327,6 +329,7 @@ class _Solver:
                     chi2_per_pixel=chi2 / pixels,
                 )
             )
+            del model  # its memory is needed for the next one
             at = at + step
             if moved < tolerance_points and whole:
                 self.converged = True
@@ -362,11 +365,11 @@ class _Solver:
     def _model(self, at: Vector, frames: list[int], *, with_slopes: bool) -> _Model:
         kernel = self._total.kernel(at)
         shape, threads = self._sky.transit.shape, self._threads
-        slopes = self._total.slopes(at)
+        slopes = self._total.slopes(at) if with_slopes else []
         return _Model(
             images=self.reconstruction(kernel, frames),
             kernel=kernel,
-            slope_blurs=[Blur(s, shape, threads=threads) for s in slopes] if with_slopes else [],
+            slope_blurs=[Blur(s, shape, threads=threads) for s in slopes],
             curve=cumulative_curve(kernel, self._total.radii_px),
             curve_slopes=self._total.curve_slopes(slopes),
         )

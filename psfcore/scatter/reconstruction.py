@@ -15,7 +15,7 @@ from typing import Self, TypeVar
 import numpy as np
 
 from psfcore.arrays import Kernel, Matrix, Vector
-from psfcore.scatter.scenes import Scenes, StoredScene
+from psfcore.scatter.scenes import Scenes
 from psfcore.scatter.shapes import Shape
 from psfcore.scatter.total_psf import Blur, Lanes, Optics, Pixels, TotalPsf, put
 from psfcore.transit.occulter import LARGEST_SHIFT_PX, FoundPlace, find_occulter, fully_dark
@@ -91,32 +91,38 @@ class TransitScenes:
     @classmethod
     def reconstructed(cls, transit: Transit, optics: Optics, progress: Progress) -> TransitScenes:
         """Step (d): the scenes of all images; no occulter is located yet."""
+        scenes = Scenes(len(transit.frames), optics.engine.lanes_shape)
 
-        def scene(optics: Optics, n: int) -> StoredScene:
-            return StoredScene.of(optics.invert(optics.lanes(transit.frames[n].pixels)))
+        def scene(optics: Optics, n: int) -> None:
+            observed, start = optics.fields
+            optics.lanes(transit.frames[n].pixels, out=observed)
+            start[:] = observed
+            scenes[n] = optics.invert(observed, start)
 
         every = range(len(transit.frames))
-        scenes = on_threads(
-            scene, every, optics.twins(), lambda step: progress("reconstructing", step, len(every))
-        )
-        return cls(transit, Scenes(scenes))
+        on_threads(scene, every, optics.twins(), lambda step: progress("reconstructing", step, len(every)))
+        return cls(transit, scenes)
 
     def improve(self, n: int, optics: Optics, steps: int) -> Lanes:
-        """Step (d) again: continue from the scene of image n for some steps, and return the new scene.
+        """Step (d) again: continue from the scene of image n for some steps.
+
+        Returns the new scene, which is overwritten when these optics reconstruct the next one.
 
         If the PSF has little power at some frequencies, each step restores more of them and amplifies their noise more.
         Then the reconstruction begins again, so that the scene does not depend on the number of rounds.
         """
-        observed = optics.lanes(self.transit.frames[n].pixels)
+        observed, scene = optics.fields
+        optics.lanes(self.transit.frames[n].pixels, out=observed)
         if optics.least_transfer >= SETTLING_TRANSFER:
-            scene = optics.invert(observed, self.scenes[n], steps=steps)
+            optics.invert(observed, self.scenes.stored(n).lanes(out=scene), steps=steps)
         else:
-            scene = optics.invert(observed)
+            scene[:] = observed
+            optics.invert(observed, scene)
         self.scenes[n] = scene
         return scene
 
     def copy(self) -> TransitScenes:
-        """A second object with the same contents. Arrays are shared, because no code writes to them."""
+        """A second object with the same contents."""
         return replace(self, scenes=self.scenes.copy(), found=list(self.found), dark=list(self.dark))
 
     def find(
@@ -226,7 +232,9 @@ class Reconstruction:
         scene
             The scene of the image, whose dark pixels are set to 0; default: the stored scene.
         """
-        scene = self._blanked(n, self.sky.scenes[n] if scene is None else scene)
+        if scene is None:
+            scene = self.sky.scenes.stored(n).lanes(out=self.optics.fields[0])
+        self._blanked(n, scene)
         expected, jacobian = self.optics.light_in(self.sky.dark[n], scene, slopes)
         return self.observed(n) - expected, expected, jacobian
 

@@ -1,14 +1,17 @@
 """Scenes in half the memory of float32: numbers of 16 bits, with one power of two as a factor for each scene.
 
-A scene is where an iteration continues, and what a PSF scatters into a disc. A number of 16 bits has a relative error of
-at most 2^-11, which is random from pixel to pixel. The first step of a continued iteration removes it. In the light that
-a scene scatters into a pixel, it is far below the noise of this pixel: for HRI_EUV, its rms is 2e-5 of that light.
+A scene is where an iteration continues, and what a PSF scatters into a disc. A number of 16 bits has a relative error
+of at most 2^-11, which is random from pixel to pixel. The first step of a continued iteration removes it. In the light
+that a scene scatters into a pixel, it is far below the noise of this pixel: at most 2e-5 of that light (rms, HRI_EUV).
+
+All scenes lie in one array: arrays of single scenes, which threads replace all the time, would leave holes in the
+memory.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import overload
 
@@ -16,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.convolution.engine import BLOCK_ROWS
-from psfcore.convolution.lanes import LANES
 
 Lanes = NDArray[np.float32]
 _LARGEST_EXPONENT = 15  # all numbers of a scene are below 2^15; float16 ends at 65504
@@ -24,7 +26,7 @@ _LARGEST_EXPONENT = 15  # all numbers of a scene are below 2^15; float16 ends at
 
 @dataclass(frozen=True, eq=False)
 class StoredScene:
-    """A scene in the memory order of the convolution engine.
+    """A scene in the memory order of the convolution engine, as it is stored.
 
     Attributes
     ----------
@@ -35,22 +37,11 @@ class StoredScene:
     values: NDArray[np.float16]
     exponent: int
 
-    @classmethod
-    def of(cls, lanes: Lanes) -> StoredScene:
-        """Store a scene. A scene that was read from a stored one is stored without any change."""
-        mantissa, exponent = math.frexp(max(float(lanes.max()), -float(lanes.min())))
-        # A maximum that is rounded up to a power of two has the exponent that it will have when it is stored again.
-        exponent += int(np.float16(mantissa) == 1) - _LARGEST_EXPONENT
-        factor, values = np.float32(2.0**-exponent), np.empty(lanes.shape, np.float16)
-        for block, stored in zip(lanes, values, strict=True):  # a block stays in the cache
-            stored[:] = block * factor
-        return cls(values, exponent)
-
-    def lanes(self, blocks: slice = slice(None)) -> Lanes:
-        """The scene, or some of its blocks of rows."""
+    def lanes(self, blocks: slice = slice(None), *, out: Lanes | None = None) -> Lanes:
+        """The scene, or some of its blocks of rows, in `out` if it is given."""
         values, factor = self.values[blocks], np.float32(2.0**self.exponent)
-        lanes = np.empty(values.shape, np.float32)
-        for block, stored in zip(lanes, values, strict=True):
+        lanes = np.empty(values.shape, np.float32) if out is None else out
+        for block, stored in zip(lanes, values, strict=True):  # a block stays in the cache
             np.multiply(stored, factor, out=block)
         return lanes
 
@@ -64,28 +55,48 @@ class StoredScene:
 
 
 class Scenes(Sequence[Lanes]):
-    """The scenes of all images. An item is a copy in float32; to assign an item stores a scene."""
+    """The scenes of all images. An item is a copy in float32; to assign an item stores a scene.
 
-    def __init__(self, scenes: Iterable[Lanes | StoredScene]) -> None:
-        self._stored = [s if isinstance(s, StoredScene) else StoredScene.of(s) for s in scenes]
+    Parameters
+    ----------
+    count
+        The number of images.
+    lanes_shape
+        The shape of a scene in the memory order of the convolution engine.
+    """
+
+    def __init__(self, count: int, lanes_shape: tuple[int, ...]) -> None:
+        self._values = np.empty((count, *lanes_shape), np.float16)
+        self._exponents = np.zeros(count, np.int64)
 
     @overload
     def __getitem__(self, n: int) -> Lanes: ...
     @overload
     def __getitem__(self, n: slice) -> list[Lanes]: ...
     def __getitem__(self, n: int | slice) -> Lanes | list[Lanes]:
-        return [s.lanes() for s in self._stored[n]] if isinstance(n, slice) else self._stored[n].lanes()
+        if isinstance(n, slice):
+            return [self.stored(k).lanes() for k in range(len(self))[n]]
+        return self.stored(n).lanes()
 
     def __setitem__(self, n: int, lanes: Lanes) -> None:
-        self._stored[n] = StoredScene.of(lanes)
+        """Store a scene. A scene that was read from a stored one is stored without any change."""
+        mantissa, exponent = math.frexp(max(float(lanes.max()), -float(lanes.min())))
+        # A maximum that is rounded up to a power of two has the exponent that it will have when it is stored again.
+        exponent += int(np.float16(mantissa) == 1) - _LARGEST_EXPONENT
+        factor = np.float32(2.0**-exponent)
+        for block, stored in zip(lanes, self._values[n], strict=True):
+            stored[:] = block * factor
+        self._exponents[n] = exponent
 
     def __len__(self) -> int:
-        return len(self._stored)
+        return len(self._values)
 
     def stored(self, n: int) -> StoredScene:
-        """A scene as it is stored."""
-        return self._stored[n]
+        """A scene as it is stored; only the part of it that is read becomes float32."""
+        return StoredScene(self._values[n], int(self._exponents[n]))
 
     def copy(self) -> Scenes:
-        """A second object with the same scenes, which share their memory."""
-        return Scenes(self._stored)
+        """A second object with the same scenes."""
+        other = Scenes(0, self._values.shape[1:])
+        other._values, other._exponents = self._values.copy(), self._exponents.copy()
+        return other

@@ -155,9 +155,12 @@ def _solution(archive: NpzFile, transit: Transit, threads: int) -> Solution:
     coordinates = _array(archive, "coordinates", np.float64, size)
     optics = Optics(total.kernel(coordinates), transit.shape, threads=threads)
     every, lanes = range(len(transit.frames)), optics.engine.lanes_shape
+    scenes = Scenes(len(every), lanes)
+    for n in every:
+        scenes[n] = _array(archive, f"scene-{n:04d}", np.float32, *lanes)
     sky = TransitScenes(
         transit,
-        scenes=Scenes(_array(archive, f"scene-{n:04d}", np.float32, *lanes) for n in every),
+        scenes=scenes,
         found=list(contents.found),
         dark=[_dark(archive, n, transit.shape) for n in every],
     )

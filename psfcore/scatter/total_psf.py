@@ -58,7 +58,7 @@ from numpy.typing import NDArray
 
 from psfcore.arrays import Kernel, Matrix, Vector
 from psfcore.convolution.convolver import Convolver
-from psfcore.convolution.engine import BLOCK_ROWS, Engine
+from psfcore.convolution.engine import BLOCK_ROWS, Engine, aligned
 from psfcore.convolution.lanes import LANES
 from psfcore.deconvolve.assess.error_planes import sigma_points
 from psfcore.deconvolve.iterations.linear import (
@@ -78,7 +78,7 @@ DIFFRACTION, SCATTER = "DIFFRACTION", "SCATTER"
 Lanes = NDArray[np.float32]
 Pixels = tuple[NDArray[np.intp], NDArray[np.intp]]  # (rows, columns) of single pixels
 STEPS = 5
-# A step that changes a scene by less than this fraction (rms) leaves an error about a hundred times smaller, which is the
+# A step that changes a scene by less than this fraction (rms) leaves an error about fifty times smaller, which is the
 # rounding of float32 in the dark pixels. This holds for a PSF with at least LEAST_TRANSFER at all frequencies.
 SETTLED = 1e-3
 # Noise beyond this distance from a disc adds less than 1e-5 to the variance of sums over the disc.
@@ -106,6 +106,12 @@ class TotalPsf:
         self.size = min(2 * max(field_shape), REACH_GRID_PX)
         self._convolver = Convolver(diffraction, (self.size, self.size), dtype=np.float64, threads=threads)
 
+    def of(self, shape: Shape) -> TotalPsf:
+        """The same computation for another shape."""
+        other = copy.copy(self)
+        other.shape = shape
+        return other
+
     def kernel(self, coordinates: Vector) -> Kernel:
         """The total PSF [y, x] at these coordinates of the shape."""
         return self.diffracted(self.shape.kernel(coordinates, self.size))
@@ -129,7 +135,10 @@ class TotalPsf:
 
     def curve_slopes(self, slopes: list[Kernel]) -> Matrix:
         """The derivatives of C(R) = 100 (1 - encircled energy), in percent: array (radii, coordinates)."""
-        return np.stack([-100 * encircled_energy(slope, self.radii_px) for slope in slopes], axis=1)
+        of_curve = np.empty((self.radii_px.size, len(slopes)))
+        for column, slope in zip(of_curve.T, slopes, strict=True):
+            column[:] = -100 * encircled_energy(slope, self.radii_px)
+        return of_curve
 
 
 def curve_sigma(slopes: Iterable[Kernel], covariance: Matrix, radii_px: Vector) -> Vector:
@@ -209,9 +218,9 @@ class Blur:
             twin.engine = self.engine.twin()
         return twins
 
-    def lanes(self, field: NDArray[np.floating]) -> Lanes:
-        """A field [y, x] rearranged into the engine's order."""
-        return self.engine.to_lanes(field)
+    def lanes(self, field: NDArray[np.floating], *, out: Lanes | None = None) -> Lanes:
+        """A field [y, x] rearranged into the engine's order, in `out` if it is given."""
+        return self.engine.to_lanes(field, out=out)
 
     def field(self, lanes: Lanes) -> NDArray[np.float32]:
         """The field [y, x], rearranged from the engine's order."""
@@ -257,7 +266,24 @@ class Optics(Blur):
     def __init__(self, psf_kernel: Kernel, field_shape: tuple[int, int], *, threads: int = 1) -> None:
         super().__init__(psf_kernel, field_shape, threads=threads)
         self._inverse = inverse_filter(self.engine)
+        self._fields: tuple[Lanes, Lanes] | None = None
         self.least_transfer = float(np.abs(transfer_sample(self.engine).values).min())
+
+    def twins(self) -> list[Self]:
+        """The same operator for each thread, each with its own working memory."""
+        twins = super().twins()
+        if len(twins) > 1:
+            for twin in twins:
+                twin._fields = None
+                _ = twin.fields
+        return twins
+
+    @property
+    def fields(self) -> tuple[Lanes, Lanes]:
+        """Working memory for two fields; it is kept, because memory that is taken for every image is left in pieces."""
+        if self._fields is None:
+            self._fields = aligned(*self.engine.lanes_shape), aligned(*self.engine.lanes_shape)
+        return self._fields
 
     def invert_once(self, lanes: Lanes, *, adjoint: bool = False) -> Lanes:
         """G y, or G^T y if `adjoint`."""
@@ -269,17 +295,17 @@ class Optics(Blur):
         Parameters
         ----------
         start
-            First estimate; default: the observation.
+            First estimate, which is overwritten; default: the observation.
         """
-        first = observed if start is None else start
+        first = observed.copy() if start is None else start
         settled = SETTLED if self.least_transfer >= LEAST_TRANSFER else 0.0
         return solve_linear(self.engine, self._inverse, observed, first, steps, settled=settled)  # Eq. (1)
 
     def light_in(self, pixels: Pixels, scene: Lanes, slopes: Sequence[Blur] = ()) -> tuple[Vector, Matrix]:
         """The light that a scene scatters into single pixels, and how it changes with the PSF, Eq. (5).
 
-        The result is that of `convolve` and `invert_once` one after the other, but the scene is transformed only once, and
-        fields are not written to memory. The derivatives have the shape (slopes, pixels).
+        The result is that of `convolve` and `invert_once` one after the other, but the scene is transformed only once,
+        and fields are not written to memory. The derivatives have the shape (slopes, pixels).
 
         Parameters
         ----------
@@ -299,9 +325,9 @@ class Optics(Blur):
         engine.multiply_kept(engine.transfer)
         light = pick(self._rows(first, stop), here)
         responses = np.empty((len(slopes), light.size))
-        for response, slope in zip(responses, slopes, strict=True):
+        for k, slope in enumerate(slopes):
             engine.multiply_kept(slope.engine.transfer)
-            response[:] = pick(self._rows(first, stop), here)
+            changed = pick(self._rows(first, stop), here)
             engine.rows_cut()
             engine.multiply_columns(self._inverse)
             around = self._rows(first, stop)
@@ -309,7 +335,7 @@ class Optics(Blur):
             engine.rows_cut()
             engine.rows_forward(around, first)
             engine.multiply_columns(engine.transfer)
-            response -= pick(self._rows(first, stop), here)
+            responses[k] = changed - pick(self._rows(first, stop), here)
         return light, responses
 
 

@@ -119,9 +119,14 @@ def exposure_of(
             "no-exposure",
             f"{file}: expected XPOSURE or EXPTIME above 0 s in the header; got neither: add one of these keywords",
         )
-    pixels, dn_per_unit = np.empty(image.pixels.shape, np.float32), 1.0 if unit.kind == "rate" else image.exposure_s
+    pixels, dn_per_unit = (
+        np.empty(image.pixels.shape, np.float32),
+        1.0 if unit.kind == "rate" else image.exposure_s,
+    )
     with np.errstate(over="ignore"):  # a value too large for float32 becomes infinite and so a gap
-        for rate, stored in zip(pixels, image.pixels, strict=True):  # rows, because whole planes leave the cache
+        for rate, stored in zip(
+            pixels, image.pixels, strict=True
+        ):  # rows, because whole planes leave the cache
             rate[:] = stored * unit.scale / dn_per_unit
     gaps = ~np.isfinite(pixels)
     gaps |= image.mask != 0

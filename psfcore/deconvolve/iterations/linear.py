@@ -140,13 +140,13 @@ def solve_linear(
     Parameters
     ----------
     start
-        The first estimate.
+        The first estimate, which is overwritten by the result.
     step_filter
         The filter of a step, as for `Additive`.
     settled
         The iteration ends before `steps` if a step changes the estimate by less than this fraction (rms).
     """
-    x, rows = start.copy(), engine.field_shape[0]
+    x, rows = start, engine.field_shape[0]
     changes, sums = np.zeros((2, engine.row_blocks)), np.zeros(engine.row_blocks)
     rows_judged = np.zeros((engine.row_blocks, 2, LANES), np.float32)
     nothing = Judgement(rows_judged, 0, 0, 0, np.float32(0), np.float32(1), sums)

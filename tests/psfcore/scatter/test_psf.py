@@ -115,7 +115,7 @@ def test_inversion_recovers_the_scene() -> None:
         observed = optics.lanes(Convolver(kernel, shape, dtype=np.float64).apply(x))
         off = {n: np.abs(optics.field(optics.invert(observed, steps=n)) - x).max() for n in (0, 1, 2, 5, 8)}
         assert off[0] > 500
-        assert off[8] < off[5] < off[2] < off[1]
+        assert off[8] == off[5] <= off[2] < off[1], "it ends when it is settled"
         assert off[5] < 0.5
         nearly = optics.invert(observed, optics.lanes(x + 1.0), steps=3)
         np.testing.assert_allclose(optics.field(nearly), x, atol=0.1)
