@@ -264,9 +264,9 @@ def overdispersion(inversion: Inversion) -> float:
 def _on_full_reach(solution: Solution, factor: float, threads: int) -> tuple[Kernel, Kernel, Curve, Curve]:
     """Total PSF and scatter kernel [y, x] on the full reach, and C(R) of both with errors."""
     shape, at = solution.inversion.shape, solution.inversion.coordinates
-    radii, field = np.array(RADII_PX), (REACH_GRID_PX, REACH_GRID_PX)
-    total = solution.total
-    if total.size < REACH_GRID_PX:
+    radii, total = np.array(RADII_PX), solution.total
+    if total.size != REACH_GRID_PX:
+        field = (REACH_GRID_PX // 2, REACH_GRID_PX // 2)  # the smallest field with total PSFs on the full reach
         total = TotalPsf(solution.transit.diffraction, shape, field, threads=threads)
     scatter = shape.kernel(at, REACH_GRID_PX)
     kernel = np.maximum(total.diffracted(scatter), 0.0)

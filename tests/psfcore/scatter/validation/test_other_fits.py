@@ -106,7 +106,8 @@ def bend_slope(solution: Solution) -> np.ndarray:
 
 
 def test_few_images_have_no_held_out_gain_and_other_shapes_are_refused() -> None:
-    few = dataclasses.replace(solved(), part=solved().part[3:8])
+    five = dataclasses.replace(solved().inversion, frames=solved().inversion.frames[3:8])
+    few = dataclasses.replace(solved(), part=solved().part[3:8], inversion=five)
     inversion = dataclasses.replace(solved().inversion, shape=SHAPES["knee"])
     with patch.object(robustness, "SHAPES", {"knee": SHAPES["knee"]}):
         assert all(shape.held_out_gain is None for shape in compare_shapes(few))
