@@ -224,18 +224,19 @@ def fit_transit(
 class _FitProgress:
     """Progress of the whole fit, computed from the progress of its stages.
 
-    A stage reports once for each image. The number of rounds is estimated; the total grows if a fit needs more rounds.
+    A pass of a stage reports once for each image. The number of rounds is estimated; the total grows if a fit needs
+    more rounds.
     """
 
-    _COST: ClassVar[dict[str, float]] = {"reconstructing": 1.0, "errors": 1.2, "comparing": 2.5, "free": 1.0}
-    _ROUND, _ROUNDS, _PUBLISHED_ROUND = 1.2, 4.0, 2.0
+    _COST: ClassVar[dict[str, float]] = {"reconstructing": 1.0, "errors": 0.1, "comparing": 2.0, "free": 0.8}
+    _ROUND, _ROUNDS, _COMPARING_PASSES, _PUBLISHED_ROUND = 1.6, 4.0, 2, 2.0
 
     def __init__(self, progress: Progress, frames: int, *, compared: bool, published: int) -> None:
         self._progress, self._done = progress, 0.0
         visits = (
             sum(self._COST.values())
             + self._ROUND * self._ROUNDS
-            - (0 if compared else self._COST["comparing"])
+            + ((self._COMPARING_PASSES if compared else 0) - 1) * self._COST["comparing"]
         )
         self._total = frames * (visits + published * 6 * 2 * self._PUBLISHED_ROUND)
 
@@ -266,7 +267,10 @@ def _on_full_reach(solution: Solution, factor: float, threads: int) -> tuple[Ker
     shape, at = solution.inversion.shape, solution.inversion.coordinates
     radii, total = np.array(RADII_PX), solution.total
     if total.size != REACH_GRID_PX:
-        field = (REACH_GRID_PX // 2, REACH_GRID_PX // 2)  # the smallest field with total PSFs on the full reach
+        field = (
+            REACH_GRID_PX // 2,
+            REACH_GRID_PX // 2,
+        )  # the smallest field with total PSFs on the full reach
         total = TotalPsf(solution.transit.diffraction, shape, field, threads=threads)
     scatter = shape.kernel(at, REACH_GRID_PX)
     kernel = np.maximum(total.diffracted(scatter), 0.0)

@@ -80,7 +80,7 @@ class TransitScenes:
     """The latest scenes of all images of a transit, and the positions of their occulters.
 
     Scenes are stored in the memory order of the convolution engine (see `psfcore.scatter.total_psf`). Images are not,
-    because a second copy of them would take a third of the memory of a fit.
+    because a second copy of them would take half the memory of a fit.
     """
 
     transit: Transit
