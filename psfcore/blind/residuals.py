@@ -53,8 +53,9 @@ class LinearEstimator:
         clean = Reconstruction(transit, total, optics, sky, tuple(images), threads=1)
         slopes = [Blur(slope, shape) for slope in total.slopes(at)]
         self._clean = clean
-        self._residuals, expected = zip(*(clean.residual(n) for n in images), strict=True)
-        self._jacobians = [np.array([clean.jacobian(n, slope) for slope in slopes]) for n in images]
+        self._residuals, expected, self._jacobians = zip(
+            *(clean.residual_with_jacobian(n, slopes) for n in images), strict=True
+        )
         self._weights = [clean.weight(n, expected[n]) for n in images]
         self._observed = [float(clean.observed(n).mean()) for n in images]
 
@@ -71,7 +72,7 @@ class LinearEstimator:
             replace(frame, pixels=pixels) for frame, pixels in zip(clean.transit.frames, images, strict=True)
         )
         transit = replace(clean.transit, frames=tuple(frames))
-        sky = replace(clean.sky, transit=transit, scenes=list(clean.sky.scenes))
+        sky = replace(clean.sky.copy(), transit=transit)
         for n in range(len(images)):
             sky.improve(n, clean.optics, _WARM_STEPS)
         changed = replace(clean, transit=transit, sky=sky)

@@ -140,6 +140,8 @@ class Engine:
         twin = copy.copy(self)
         twin.release()
         twin._use_threads(1)
+        # Taken here, because memory that many threads take and give back is left in pieces that are not used again.
+        _ = twin._spectrum
         return twin
 
     @cached_property
@@ -147,9 +149,15 @@ class Engine:
         """The spectrum of the field, in blocks of columns. It must be asked for before threads share it."""
         return aligned(self.column_blocks, self.row_blocks * BLOCK_ROWS, 2, LANES)
 
+    @cached_property
+    def _whole(self) -> Single:
+        """The spectrum along both axes that `transform_columns` keeps."""
+        return aligned(self.column_blocks, self.column_plan.length, 2, LANES)
+
     def release(self) -> None:
-        """Give back the memory of the spectrum; the next transform takes it again."""
+        """Give back the memory of the spectra; the next transform takes it again."""
         self.__dict__.pop("_spectrum", None)
+        self.__dict__.pop("_whole", None)
 
     @property
     def nbytes(self) -> int:
@@ -166,13 +174,13 @@ class Engine:
 
     def apply(self, x: NDArray[np.floating]) -> Single:
         """The field [y, x] convolved with the PSF, H x."""
-        return self._whole(x, adjoint=False)
+        return self._operator(x, adjoint=False)
 
     def adjoint(self, y: NDArray[np.floating]) -> Single:
         """The field [y, x] correlated with the PSF, H^T y."""
-        return self._whole(y, adjoint=True)
+        return self._operator(y, adjoint=True)
 
-    def _whole(self, field: NDArray[np.floating], *, adjoint: bool) -> Single:
+    def _operator(self, field: NDArray[np.floating], *, adjoint: bool) -> Single:
         lanes = self.to_lanes(field)
         self.rows_forward(lanes)
         self.columns(adjoint=adjoint)
@@ -181,21 +189,29 @@ class Engine:
 
     # Steps that a method combines -------------------------------------------------------------------
 
-    def to_lanes(self, field: NDArray[np.floating], *, padding: float = 0.0) -> Single:
-        """Convert a field (ny, nx) to the engine's layout. Additional rows that complete the last block hold
-        `padding`.
+    def to_lanes(
+        self, field: NDArray[np.floating], *, padding: float = 0.0, out: Single | None = None
+    ) -> Single:
+        """Convert a field (ny, nx) to the engine's layout, into `out` if it is given. Additional rows that complete the
+        last block hold `padding`.
         """
         if field.shape != self.field_shape:
             raise DataError("field-shape", f"expected a field of {self.field_shape}; got {field.shape}")
-        return self.lanes_of(lambda rows: field[rows], padding=padding)
+        return self.lanes_of(lambda rows: field[rows], padding=padding, out=out)
 
-    def lanes_of(self, rows_of: Callable[[slice], NDArray[np.floating]], *, padding: float = 0.0) -> Single:
+    def lanes_of(
+        self,
+        rows_of: Callable[[slice], NDArray[np.floating]],
+        *,
+        padding: float = 0.0,
+        out: Single | None = None,
+    ) -> Single:
         """As ``to_lanes``, for a field that is computed in blocks of rows: `rows_of(rows)` returns these rows.
 
         The whole field is never in memory.
         """
         ny, nx = self.field_shape
-        lanes = aligned(*self.lanes_shape)
+        lanes = aligned(*self.lanes_shape) if out is None else out
         block = np.empty((BLOCK_ROWS, nx), np.float32)
         for n in range(self.row_blocks):
             rows = slice(n * BLOCK_ROWS, min((n + 1) * BLOCK_ROWS, ny))
@@ -218,13 +234,19 @@ class Engine:
             first = n * BLOCK_ROWS
             yield first, lanes[n].transpose(1, 2, 0).reshape(BLOCK_ROWS, nx)[: ny - first]
 
-    def rows_forward(self, lanes: Single) -> None:
-        """Transform the rows of a field into the spectrum."""
-        self.row_stage(_rows_forward, lanes, 0)
+    def rows_forward(self, lanes: Single, first_block: int = 0) -> None:
+        """Transform the rows of a field, or of the blocks of a field from `first_block` on, into the spectrum."""
+        self._stage(_rows_forward, self.row_plan, len(lanes), lanes, first_block)
 
-    def rows_inverse(self, lanes: Single) -> None:
-        """Transform the spectrum's rows back into a field."""
-        self.row_stage(_rows_inverse, lanes)
+    def rows_inverse(self, lanes: Single, first_block: int = 0) -> None:
+        """Transform the spectrum's rows back into a field, or into its blocks from `first_block` on."""
+        self._stage(_rows_inverse, self.row_plan, len(lanes), lanes, first_block)
+
+    def rows_cut(self) -> None:
+        """As ``rows_inverse`` and ``rows_forward``, without a field in memory: cut what the spectrum contains to the
+        field.
+        """
+        self.row_stage(_rows_cut, self.field_shape[1], self.field_shape[0])
 
     def columns(self, *, adjoint: bool) -> None:
         """Transform the columns, multiply by the transfer function, and transform back.
@@ -247,6 +269,17 @@ class Engine:
             Whether to multiply by the complex conjugate of the filter.
         """
         self._stage(_columns, self.column_plan, self.column_blocks, transfer, conjugate)
+
+    def transform_columns(self) -> None:
+        """Transform the columns of the spectrum, and keep the result for `multiply_kept`."""
+        self._stage(_columns_forward, self.column_plan, self.column_blocks, self._whole)
+
+    def multiply_kept(self, transfer: Single) -> None:
+        """As ``multiply_columns``, but for the field whose columns `transform_columns` transformed last.
+
+        One transform of a field then serves for several filters.
+        """
+        self._stage(_columns_inverse, self.column_plan, self.column_blocks, self._whole, transfer)
 
     def row_stage(self, kernel: Callable[..., None], *fields: object) -> None:
         """Run the compiled row function of a method on all blocks: `kernel(lines, start, stop, *fields)`.
@@ -455,15 +488,42 @@ def _rows_forward(lines: Lines, start: int, stop: int, lanes: Single, first_bloc
 
 
 @compiled()
-def _rows_inverse(lines: Lines, start: int, stop: int, lanes: Single) -> None:
+def _rows_inverse(lines: Lines, start: int, stop: int, lanes: Single, first_block: int) -> None:
     for block in range(start, stop):
-        rows_from_spectrum(lines, block)
+        rows_from_spectrum(lines, first_block + block)
         _copy(lines.buffer, lanes[block].reshape(-1), lanes.shape[1] * _SIZE)
 
 
 @compiled()
+def _rows_cut(lines: Lines, start: int, stop: int, nx: int, ny: int) -> None:
+    for block in range(start, stop):
+        clear_beyond(rows_from_spectrum(lines, block), ny - block * BLOCK_ROWS, nx)
+        rows_to_spectrum(lines, block, nx)
+
+
+@compiled()
+def clear_beyond(z: Single, rows: int, nx: int) -> None:
+    """Set the rows of a block [x, half, lane] beyond the number of rows to 0."""
+    for row in range(max(rows, 0), BLOCK_ROWS):
+        for i in range(nx):
+            z[i, row // LANES, row % LANES] = np.float32(0.0)
+
+
+@compiled()
+def _multiply(buffer: Single, transfer: Single, group: int, length: int, conjugate: bool) -> None:
+    """Multiply transformed columns by the transfer function, real or complex, or by its conjugate."""
+    for k in range(length):
+        if transfer.shape[2] == 1:
+            instructions.scale(buffer, transfer, k * _SIZE, (group * length + k) * LANES)
+        elif conjugate:
+            instructions.turn_back(buffer, transfer, k * _SIZE, (group * length + k) * _SIZE)
+        else:
+            instructions.turn(buffer, transfer, k * _SIZE, (group * length + k) * _SIZE)
+
+
+@compiled()
 def _columns(lines: Lines, start: int, stop: int, transfer: Single, conjugate: bool) -> None:
-    """Multiply columns by the transfer function, real or complex, or by its conjugate."""
+    """Convolve columns."""
     buffer, length = lines.buffer, lines.plan.length
     # A block may have more rows than the transform; the rows beyond the transform are padding and stay zero.
     filled = min(lines.spectrum.shape[1], length) * _SIZE
@@ -472,12 +532,29 @@ def _columns(lines: Lines, start: int, stop: int, transfer: Single, conjugate: b
         _copy(column, buffer, filled)
         _clear(buffer, filled, length)
         forward(buffer, lines.plan)
-        for k in range(length):
-            if transfer.shape[2] == 1:
-                instructions.scale(buffer, transfer, k * _SIZE, (group * length + k) * LANES)
-            elif conjugate:
-                instructions.turn_back(buffer, transfer, k * _SIZE, (group * length + k) * _SIZE)
-            else:
-                instructions.turn(buffer, transfer, k * _SIZE, (group * length + k) * _SIZE)
+        _multiply(buffer, transfer, group, length, conjugate)
         inverse(buffer, lines.plan)
         _copy(buffer, column, filled)
+
+
+@compiled()
+def _columns_forward(lines: Lines, start: int, stop: int, whole: Single) -> None:
+    """The first half of `_columns`, into a spectrum along both axes."""
+    filled = min(lines.spectrum.shape[1], lines.plan.length) * _SIZE
+    for group in range(start, stop):
+        column = whole[group].reshape(-1)
+        _copy(lines.spectrum[group].reshape(-1), column, filled)
+        _clear(column, filled, lines.plan.length)
+        forward(column, lines.plan)
+
+
+@compiled()
+def _columns_inverse(lines: Lines, start: int, stop: int, whole: Single, transfer: Single) -> None:
+    """The second half of `_columns`, from a spectrum along both axes."""
+    buffer, length = lines.buffer, lines.plan.length
+    filled = min(lines.spectrum.shape[1], length) * _SIZE
+    for group in range(start, stop):
+        _copy(whole[group].reshape(-1), buffer, length * _SIZE)
+        _multiply(buffer, transfer, group, length, False)
+        inverse(buffer, lines.plan)
+        _copy(buffer, lines.spectrum[group].reshape(-1), filled)

@@ -32,7 +32,6 @@ from typing import ClassVar
 import numpy as np
 
 from psfcore.arrays import Kernel, Matrix, Vector, json_attributes
-from psfcore.convolution.convolver import Convolver
 from psfcore.deconvolve.iterations.linear import LEAST_TRANSFER
 from psfcore.psf import (
     CURVE_RADII_PX,
@@ -51,14 +50,13 @@ from psfcore.scatter.as_published import (
     invert_as_published,
 )
 from psfcore.scatter.inversion import Inverter, solution_of
-from psfcore.scatter.reconstruction import Inversion, Progress, Solution
+from psfcore.scatter.reconstruction import Inversion, Progress, Solution, on_threads
 from psfcore.scatter.segments import Segments, beyond_pct, segment_sums, shells_as_published
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW, shape_named, stretch_of
-from psfcore.scatter.total_psf import Blur, curve_sigma, pick
+from psfcore.scatter.total_psf import Blur, TotalPsf, curve_sigma, pick
 from psfcore.scatter.validation.cross_validation import LIMITS, limits_json
 from psfcore.scatter.validation.robustness import ComparedShape, compare_shapes
 from psfcore.transit.first_guess import FirstGuess, first_guess
-from psfcore.transit.occulter import disc_distance
 from psfcore.transit.transit import Transit
 
 RADII_PX = (*CURVE_RADII_PX, 500.0, 1000.0)
@@ -189,7 +187,7 @@ def fit_transit(
     """
     form = shape_named(shape)
     power_law = form is SOFTENED_POWER_LAW
-    guess = first_guess(transit)
+    guess = first_guess(transit, threads=threads)
     progress = _FitProgress(
         progress,
         len(transit.frames),
@@ -198,9 +196,9 @@ def fit_transit(
     )
     solution = solution_of(transit, form, solution, threads=threads, progress=progress)
     factor = overdispersion(solution.inversion)
-    kernel, scatter, curve, diffuse = _on_full_reach(solution, factor, threads)
     free = _free_shells(solution, seed, progress) if form.isotropic else None
     shapes = compare_shapes(solution, progress=progress) if power_law else ()
+    kernel, scatter, curve, diffuse = _on_full_reach(solution, factor, threads)
     invert_at = partial(invert_as_published, transit, seed=seed, threads=threads, progress=progress)
     published, alone = None, {}
     if as_published:
@@ -226,18 +224,19 @@ def fit_transit(
 class _FitProgress:
     """Progress of the whole fit, computed from the progress of its stages.
 
-    A stage reports once for each image. The number of rounds is estimated; the total grows if a fit needs more rounds.
+    A pass of a stage reports once for each image. The number of rounds is estimated; the total grows if a fit needs
+    more rounds.
     """
 
-    _COST: ClassVar[dict[str, float]] = {"reconstructing": 1.0, "errors": 1.2, "comparing": 2.5, "free": 1.0}
-    _ROUND, _ROUNDS, _PUBLISHED_ROUND = 1.2, 4.0, 2.0
+    _COST: ClassVar[dict[str, float]] = {"reconstructing": 1.0, "errors": 0.1, "comparing": 2.0, "free": 0.8}
+    _ROUND, _ROUNDS, _COMPARING_PASSES, _PUBLISHED_ROUND = 1.6, 4.0, 2, 2.0
 
     def __init__(self, progress: Progress, frames: int, *, compared: bool, published: int) -> None:
         self._progress, self._done = progress, 0.0
         visits = (
             sum(self._COST.values())
             + self._ROUND * self._ROUNDS
-            - (0 if compared else self._COST["comparing"])
+            + ((self._COMPARING_PASSES if compared else 0) - 1) * self._COST["comparing"]
         )
         self._total = frames * (visits + published * 6 * 2 * self._PUBLISHED_ROUND)
 
@@ -265,21 +264,24 @@ def overdispersion(inversion: Inversion) -> float:
 
 def _on_full_reach(solution: Solution, factor: float, threads: int) -> tuple[Kernel, Kernel, Curve, Curve]:
     """Total PSF and scatter kernel [y, x] on the full reach, and C(R) of both with errors."""
-    inversion = solution.inversion
-    shape, at = inversion.shape, inversion.coordinates
-    radii = np.array(RADII_PX)
-    grid = (REACH_GRID_PX, REACH_GRID_PX)
-    diffract = Convolver(solution.transit.diffraction, grid, dtype=np.float64, threads=threads)
+    shape, at = solution.inversion.shape, solution.inversion.coordinates
+    radii, total = np.array(RADII_PX), solution.total
+    if total.size != REACH_GRID_PX:
+        field = (
+            REACH_GRID_PX // 2,
+            REACH_GRID_PX // 2,
+        )  # the smallest field with total PSFs on the full reach
+        total = TotalPsf(solution.transit.diffraction, shape, field, threads=threads)
     scatter = shape.kernel(at, REACH_GRID_PX)
-    kernel = np.maximum(diffract.apply(scatter), 0.0)
-    # Single precision is sufficient for the derivatives and takes half the time.
-    diffract = Convolver(solution.transit.diffraction, grid, dtype=np.float32, threads=threads)
-    diffuse_slopes = [shape.slope(at, k, REACH_GRID_PX) for k in range(at.size)]
-    total_slopes = (np.asarray(diffract.apply(slope), np.float64) for slope in diffuse_slopes)
+    kernel = np.maximum(total.diffracted(scatter), 0.0)
+    total_slopes = (total.slope(at, k) for k in range(at.size))
+    diffuse_slopes = (shape.slope(at, k, REACH_GRID_PX) for k in range(at.size))
 
     def curve(of: Kernel, slopes: Iterable[Kernel]) -> Curve:
         return Curve(
-            radii, cumulative_curve(of, radii), curve_sigma(slopes, inversion.covariance * factor, radii)
+            radii,
+            cumulative_curve(of, radii),
+            curve_sigma(slopes, solution.inversion.covariance * factor, radii),
         )
 
     return kernel, scatter, curve(kernel, total_slopes), curve(scatter, diffuse_slopes)
@@ -292,25 +294,24 @@ def _free_shells(solution: Solution, seed: int, progress: Progress) -> ShellWeig
     """
     segments = Segments(shells_as_published())
     diffract = Blur(solution.transit.diffraction, solution.transit.shape, threads=solution.threads)
-    parts = []
-    for step, n in enumerate(solution.part):
-        progress("free shells", step, len(solution.part))
-        frame, dark = solution.transit.frames[n], solution.sky.dark[n]
-        blanked = solution.blanked_scene(n)
-        diffracted = diffract.convolve(blanked)
-        expected = pick(solution.optics.convolve(blanked), dark)
-        distance = disc_distance(solution.transit.shape, solution.sky.found[n].place)[dark]
-        parts.append(
-            Equations(
-                observed=solution.observed(n),
-                ring_sums=segment_sums(
-                    diffract.field(diffracted), np.stack(dark, axis=1), segments, threads=solution.threads
-                ),
-                unscattered=pick(diffracted, dark),
-                scale=1 / np.sqrt(solution.weight(n, expected)),
-                stratum=np.maximum(np.floor(frame.place.radius_px - distance), 0).astype(np.int64),
-            )
+
+    def equations(tool: tuple[Solution, Blur], n: int) -> Equations:
+        solution, diffract = tool
+        frame, dark, place = solution.transit.frames[n], solution.sky.dark[n], solution.sky.found[n].place
+        _, expected = solution.residual(n)
+        diffracted = diffract.convolve(solution.blanked_scene(n))
+        distance = np.hypot(dark[0] - place.y_px, dark[1] - place.x_px)
+        return Equations(
+            observed=solution.observed(n),
+            ring_sums=segment_sums(diffract.field(diffracted), np.stack(dark, axis=1), segments),
+            unscattered=pick(diffracted, dark),
+            scale=1 / np.sqrt(solution.weight(n, expected)),
+            stratum=np.maximum(np.floor(frame.place.radius_px - distance), 0).astype(np.int64),
         )
+
+    count = len(solution.part)
+    tools = list(zip(solution.twins(), diffract.twins(), strict=True))
+    parts = on_threads(equations, solution.part, tools, lambda step: progress("free shells", step, count))
     shape, at = solution.inversion.shape, solution.inversion.coordinates
     towards = segments.mean_of_map(shape.kernel(at, REACH_GRID_PX))
     counts = segments.counts.astype(np.float64)

@@ -36,6 +36,7 @@ Differences from the paper; the benefit of each was measured on simulated transi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -56,16 +57,25 @@ from psfcore.scatter.reconstruction import (
     on_threads,
 )
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Shape
-from psfcore.scatter.total_psf import Blur, Optics, TotalPsf, noise_covariance
+from psfcore.scatter.total_psf import (
+    NOISE_REACH_PX,
+    Blur,
+    Optics,
+    TotalPsf,
+    around_disc,
+    noise_covariance,
+)
 from psfcore.transit.transit import Transit
 
-ALGORITHM_VERSION = 2  # of `invert`: a change of its results needs a new number, because solutions are kept
+ALGORITHM_VERSION = 3  # of `invert`: a change of its results needs a new number, because solutions are kept
 PILOT_FRAMES = 16
 PILOT_CONVERGED_POINTS = 0.3
 CONVERGED_POINTS = 0.02  # limit for the change of C(R), in percentage points: a tenth of the allowed bias
 ROUNDS = 12
 WARM_STEPS = 3
-SLOPES_KEPT_BELOW_POINTS = 0.3
+# The Jacobian is kept while C(R) changes by less than this multiple of the tolerance. A Jacobian of another PSF moves
+# the minimum by the relative error of the Jacobian times the standard error of the fit.
+SLOPES_KEPT_TOLERANCES = 3.0
 LEAST_FRAMES = 3
 WEAKEST_DIRECTION = 1e-10  # smallest allowed eigenvalue of the normal matrix, after scaling its diagonal to 1
 
@@ -245,17 +255,14 @@ class _Model:
     """The images with the PSF at given coordinates, and the derivatives of this PSF."""
 
     images: Reconstruction
+    kernel: Kernel
     slope_blurs: list[Blur]
     curve: Vector
     curve_slopes: Matrix
 
     def twins(self) -> list[_Model]:
         """The same for each thread, see `on_threads`."""
-        blurs = [blur.twins() for blur in self.slope_blurs]
-        return [
-            replace(self, images=images, slope_blurs=[of_all[k] for of_all in blurs])
-            for k, images in enumerate(self.images.twins())
-        ]
+        return [replace(self, images=images) for images in self.images.twins()]
 
 
 class _Solver:
@@ -296,12 +303,14 @@ class _Solver:
     def solve(self, at: Vector, frames: list[int], tolerance_points: float) -> Vector:
         """Iterate until C(R) changes by less than the tolerance in one round. Return the coordinates."""
         kept: dict[int, _Measured] = {}
+        curve_slopes = np.zeros((0, at.size))
         moved, self.converged = np.inf, False
         before: tuple[Vector, float] | None = None
         for _ in range(ROUNDS):
-            if moved > SLOPES_KEPT_BELOW_POINTS or not kept:
+            if moved > SLOPES_KEPT_TOLERANCES * tolerance_points:
                 kept = {}
             model = self._model(at, frames, with_slopes=not kept)
+            curve_slopes = curve_slopes if kept else model.curve_slopes
             measured = kept = self._measure(model, frames, kept)
             chi2 = sum(self._counts[n] * m.chi2 for n, m in measured.items())
             if before is not None and chi2 > 1.2 * before[1]:
@@ -309,7 +318,7 @@ class _Solver:
                 continue
             before = (at, chi2)
             step, whole = self._step(measured)
-            moved = float(np.abs(model.curve_slopes @ step).max())
+            moved = float(np.abs(curve_slopes @ step).max())
             pixels = sum(self._counts[n] * m.residual.size for n, m in measured.items())
             self.rounds.append(
                 Round(
@@ -320,6 +329,7 @@ class _Solver:
                     chi2_per_pixel=chi2 / pixels,
                 )
             )
+            del model  # its memory is needed for the next one
             at = at + step
             if moved < tolerance_points and whole:
                 self.converged = True
@@ -355,10 +365,11 @@ class _Solver:
     def _model(self, at: Vector, frames: list[int], *, with_slopes: bool) -> _Model:
         kernel = self._total.kernel(at)
         shape, threads = self._sky.transit.shape, self._threads
-        slopes = self._total.slopes(at)
+        slopes = self._total.slopes(at) if with_slopes else []
         return _Model(
             images=self.reconstruction(kernel, frames),
-            slope_blurs=[Blur(s, shape, threads=threads) for s in slopes] if with_slopes else [],
+            kernel=kernel,
+            slope_blurs=[Blur(s, shape, threads=threads) for s in slopes],
             curve=cumulative_curve(kernel, self._total.radii_px),
             curve_slopes=self._total.curve_slopes(slopes),
         )
@@ -378,12 +389,12 @@ class _Solver:
         and (4).
         """
         images = model.images
-        self._sky.improve(n, images.optics, WARM_STEPS)  # step (d)
-        residual, expected = images.residual(n)  # step (f)
+        scene = self._sky.improve(n, images.optics, WARM_STEPS)  # step (d)
+        slopes = model.slope_blurs if kept is None else ()
+        residual, expected, jacobian = images.residual_with_jacobian(n, slopes, scene)  # step (f)
         if kept is not None:
             return replace(kept, residual=residual, expected=expected)
         weight = images.weight(n, expected)
-        jacobian = np.array([images.jacobian(n, blur) for blur in model.slope_blurs])
         weighted = jacobian * weight
         return _Measured(residual, expected, weight, weighted, weighted @ jacobian.T)
 
@@ -396,17 +407,19 @@ class _Solver:
         spread = np.zeros_like(normal)
         fits = []
 
+        kernel, field = model.kernel, self._sky.transit.shape
+        reach = NOISE_REACH_PX + max(frame.place.radius_px for frame in self._sky.transit.frames)
+        part = (min(field[0], math.ceil(2 * reach)), min(field[1], math.ceil(2 * reach)))
+        near = Optics(kernel, part, threads=self._threads)
+
         def covariance_of(optics: Optics, n: int) -> Matrix:
-            frame, dark, noise = self._sky.transit.frames[n], self._sky.dark[n], self._sky.transit.noise
+            frame, dark = around_disc(self._sky.transit.frames[n], self._sky.dark[n], part)
             templates = [*measured[n].weighted, np.full(dark[0].size, 1 / dark[0].size)]
-            # The covariance of the score, and in the last row that of the mean residual, from the noise of all pixels.
-            return noise_covariance(optics, frame, dark, templates, noise)
+            # The covariance of the score, and in the last row that of the mean residual, from the noise of the pixels.
+            return noise_covariance(optics, frame, dark, templates, self._sky.transit.noise)
 
         covariances = on_threads(
-            covariance_of,
-            frames,
-            model.images.optics.twins(),
-            lambda step: self._progress("errors", step, len(frames)),
+            covariance_of, frames, near.twins(), lambda step: self._progress("errors", step, len(frames))
         )
         for (n, m), of_noise in zip(measured.items(), covariances, strict=True):
             frame, dark = self._sky.transit.frames[n], self._sky.dark[n]
@@ -423,7 +436,7 @@ class _Solver:
                     chi2=m.chi2,
                     normal=m.normal,
                     score=m.score,
-                    mean_jacobian=(m.weighted / m.weight).mean(axis=1),
+                    jacobian=m.weighted / m.weight,
                 )
             )
         inverse = np.linalg.inv(normal)

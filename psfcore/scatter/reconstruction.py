@@ -9,15 +9,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from queue import SimpleQueue
 from typing import Self, TypeVar
 
 import numpy as np
 
 from psfcore.arrays import Kernel, Matrix, Vector
+from psfcore.scatter.scenes import Scenes
 from psfcore.scatter.shapes import Shape
-from psfcore.scatter.total_psf import Blur, Lanes, Optics, Pixels, TotalPsf, pick, put
+from psfcore.scatter.total_psf import Blur, Lanes, Optics, Pixels, TotalPsf, put
 from psfcore.transit.occulter import LARGEST_SHIFT_PX, FoundPlace, find_occulter, fully_dark
 from psfcore.transit.transit import Frame, Transit
 
@@ -31,7 +31,6 @@ LARGEST_DARK_MARGIN_PX = 2.5
 LEAST_DARK_PIXELS = 30
 # The variance of a pixel is computed from its expected intensity, but at least from this fraction of the disc's mean.
 LEAST_LEVEL = 0.2
-SCENES_KEPT = 13
 # If the PSF has at least this power at all frequencies, scenes that are continued settle within the rounds of a fit.
 SETTLING_TRANSFER = 0.05
 
@@ -81,42 +80,50 @@ class TransitScenes:
     """The latest scenes of all images of a transit, and the positions of their occulters.
 
     Scenes are stored in the memory order of the convolution engine (see `psfcore.scatter.total_psf`). Images are not,
-    because a second copy of them would take a third of the memory of a fit.
+    because a second copy of them would take half the memory of a fit.
     """
 
     transit: Transit
-    scenes: list[Lanes]
+    scenes: Scenes
     found: list[FoundPlace] = field(default_factory=list)
     dark: list[Pixels] = field(default_factory=list)
 
     @classmethod
     def reconstructed(cls, transit: Transit, optics: Optics, progress: Progress) -> TransitScenes:
         """Step (d): the scenes of all images; no occulter is located yet."""
+        scenes = Scenes(len(transit.frames), optics.engine.lanes_shape)
 
-        def scene(optics: Optics, n: int) -> Lanes:
-            return optics.invert(optics.lanes(transit.frames[n].pixels))
+        def scene(optics: Optics, n: int) -> None:
+            observed, start = optics.fields
+            optics.lanes(transit.frames[n].pixels, out=observed)
+            start[:] = observed
+            scenes[n] = optics.invert(observed, start)
 
         every = range(len(transit.frames))
-        scenes = on_threads(
-            scene, every, optics.twins(), lambda step: progress("reconstructing", step, len(every))
-        )
+        on_threads(scene, every, optics.twins(), lambda step: progress("reconstructing", step, len(every)))
         return cls(transit, scenes)
 
-    def improve(self, n: int, optics: Optics, steps: int) -> None:
+    def improve(self, n: int, optics: Optics, steps: int) -> Lanes:
         """Step (d) again: continue from the scene of image n for some steps.
+
+        Returns the new scene, which is overwritten when these optics reconstruct the next one.
 
         If the PSF has little power at some frequencies, each step restores more of them and amplifies their noise more.
         Then the reconstruction begins again, so that the scene does not depend on the number of rounds.
         """
-        observed = optics.lanes(self.transit.frames[n].pixels)
+        observed, scene = optics.fields
+        optics.lanes(self.transit.frames[n].pixels, out=observed)
         if optics.least_transfer >= SETTLING_TRANSFER:
-            self.scenes[n] = optics.invert(observed, self.scenes[n], steps=steps)
+            optics.invert(observed, self.scenes.stored(n).lanes(out=scene), steps=steps)
         else:
-            self.scenes[n] = optics.invert(observed)
+            scene[:] = observed
+            optics.invert(observed, scene)
+        self.scenes[n] = scene
+        return scene
 
     def copy(self) -> TransitScenes:
-        """A second object with the same contents. Arrays are shared, because no code writes to them."""
-        return replace(self, scenes=list(self.scenes), found=list(self.found), dark=list(self.dark))
+        """A second object with the same contents."""
+        return replace(self, scenes=self.scenes.copy(), found=list(self.found), dark=list(self.dark))
 
     def find(
         self,
@@ -126,12 +133,13 @@ class TransitScenes:
     ) -> None:
         """Step (e): locate every occulter and select the fully dark pixels."""
         frames = self.transit.frames
-        scene_of = lru_cache(maxsize=SCENES_KEPT)(lambda n: optics.field(self.scenes[n]))
         places = [f.place for f in self.found] or [frame.place for frame in frames]
         self.found = []
         for n in range(len(frames)):
             progress("finding occulters", n, len(frames))
-            self.found.append(find_occulter(n, frames, scene_of, places, psf_kernel, self.transit.noise))
+            self.found.append(
+                find_occulter(n, frames, self.scenes.stored, places, psf_kernel, self.transit.noise)
+            )
         self.dark = [dark_pixels(frame, found) for frame, found in zip(frames, self.found, strict=True)]
 
     def left_out(self) -> dict[str, str]:
@@ -196,7 +204,9 @@ class Reconstruction:
 
     def blanked_scene(self, n: int) -> Lanes:
         """The scene of frame n with the dark pixels of the occulter set to zero, in the engine's order."""
-        scene = self.sky.scenes[n].copy()
+        return self._blanked(n, self.sky.scenes[n])
+
+    def _blanked(self, n: int, scene: Lanes) -> Lanes:
         put(scene, self.sky.dark[n], 0.0)
         return scene
 
@@ -208,8 +218,25 @@ class Reconstruction:
         """Observed minus expected intensity of the dark pixels of image n, r of Eq. (1), and the expected intensity,
         DN/s.
         """
-        expected = pick(self.optics.convolve(self.blanked_scene(n)), self.sky.dark[n])
-        return self.observed(n) - expected, expected
+        return self.residual_with_jacobian(n, ())[:2]
+
+    def residual_with_jacobian(
+        self, n: int, slopes: Sequence[Blur], scene: Lanes | None = None
+    ) -> tuple[Vector, Vector, Matrix]:
+        """As `residual`, and the derivatives of the expected intensity, from Eq. (4), (slopes, pixels).
+
+        Parameters
+        ----------
+        slopes
+            Derivatives of the total PSF.
+        scene
+            The scene of the image, whose dark pixels are set to 0; default: the stored scene.
+        """
+        if scene is None:
+            scene = self.sky.scenes.stored(n).lanes(out=self.optics.fields[0])
+        self._blanked(n, scene)
+        expected, jacobian = self.optics.light_in(self.sky.dark[n], scene, slopes)
+        return self.observed(n) - expected, expected, jacobian
 
     def observed(self, n: int) -> Vector:
         """The intensity of the dark pixels of image n, DN/s."""
@@ -221,20 +248,6 @@ class Reconstruction:
         """
         level = np.maximum(expected, LEAST_LEVEL * expected.mean())
         return np.asarray(1 / self.transit.noise.variance(level, self.transit.frames[n].exposure_s))
-
-    def jacobian(self, n: int, slope: Blur) -> Vector:
-        """The derivative of the expected light in the dark pixels of image n, from Eq. (4).
-
-        Parameters
-        ----------
-        slope
-            Derivative of the total PSF.
-        """
-        dark = self.sky.dark[n]
-        changed = slope.convolve(self.blanked_scene(n))
-        scene = self.optics.invert_once(changed)
-        put(scene, dark, 0.0)
-        return pick(changed, dark) - pick(self.optics.convolve(scene), dark)
 
 
 @dataclass(frozen=True)
@@ -268,8 +281,9 @@ class FrameFit:
         Standard error of the mean residual, DN/s.
     normal, score
         Matrix and right-hand side that this image adds to the normal equations of the coordinates.
-    mean_jacobian
-        Derivatives of `expected` with respect to the coordinates, DN/s.
+    jacobian
+        Derivatives of the expected intensity of each dark pixel with respect to the coordinates, DN/s, (coordinates,
+        pixels).
     """
 
     file: str
@@ -282,7 +296,12 @@ class FrameFit:
     chi2: float
     normal: Matrix
     score: Vector
-    mean_jacobian: Vector
+    jacobian: Matrix
+
+    @property
+    def mean_jacobian(self) -> Vector:
+        """The derivatives of `expected` with respect to the coordinates, DN/s."""
+        return np.asarray(self.jacobian.mean(axis=1))
 
     @property
     def residual_pct(self) -> float:

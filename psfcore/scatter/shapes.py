@@ -194,7 +194,9 @@ class Shape:
         step = np.zeros_like(coordinates)
         step[k] = DIFFERENCE
         ahead, behind = (self.kernel(coordinates + side * step, size) for side in (1, -1))
-        return np.asarray((ahead - behind) / (2 * DIFFERENCE))
+        ahead -= behind
+        ahead /= 2 * DIFFERENCE
+        return ahead
 
 
 _POWER_LAW = (

@@ -8,7 +8,8 @@ made. The PSF at the solution is computed from the coordinates.
 |---|---|
 | contents | everything that is no array, as JSON |
 | coordinates, covariance, curve_pct, curve_sigma | fields of Inversion |
-| observed, expected, noise, chi2, normal, score, mean_jacobian | fields of FrameFit; first axis: frames of the fit |
+| observed, expected, noise, chi2, normal, score | fields of FrameFit; first axis: frames of the fit |
+| jacobian-0000, ... | FrameFit.jacobian of each frame of the fit; its number is that of the frame in the transit |
 | scene-0000, ... | the scene of each frame of the transit, in the engine's order |
 | dark-0000, ... | rows and columns of the dark pixels of each frame of the transit, (2, pixels) |
 """
@@ -30,6 +31,7 @@ from psfcore.arrays import Number
 from psfcore.errors import DataError
 from psfcore.files import whole_file
 from psfcore.scatter.reconstruction import FrameFit, Inversion, Round, Solution, TransitScenes
+from psfcore.scatter.scenes import Scenes
 from psfcore.scatter.shapes import shape_named
 from psfcore.scatter.total_psf import Optics, Pixels, TotalPsf
 from psfcore.transit.occulter import FoundPlace
@@ -38,7 +40,7 @@ from psfcore.transit.transit import Transit
 MOST_BYTES = 4 * 2**30  # of a file; S3 takes up to 5 GiB in one request
 _CONTENTS = "contents"
 _NUMBERS_OF_FRAMES = ("observed", "expected", "noise", "chi2")
-_ARRAYS_OF_FRAMES = ("normal", "score", "mean_jacobian")
+_ARRAYS_OF_FRAMES = ("normal", "score")
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,7 @@ class _Contents:
         The indices of the fitted frames.
     """
 
-    version: Literal[1]
+    version: Literal[2]
     shape: str
     field: tuple[int, int]
     files: tuple[str, ...]
@@ -71,7 +73,7 @@ def write_solution(path: Path, solution: Solution) -> None:
     """
     inversion, transit, sky = solution.inversion, solution.transit, solution.sky
     contents = _Contents(
-        version=1,
+        version=2,
         shape=inversion.shape.name,
         field=transit.shape,
         files=tuple(frame.file for frame in transit.frames),
@@ -89,6 +91,8 @@ def write_solution(path: Path, solution: Solution) -> None:
         arrays[name] = np.stack([np.asarray(getattr(frame, name)) for frame in inversion.frames])
     for n, (scene, dark) in enumerate(zip(sky.scenes, sky.dark, strict=True)):
         arrays |= {f"scene-{n:04d}": scene, f"dark-{n:04d}": np.stack(dark).astype(np.int64)}
+    for n, frame in zip(solution.part, inversion.frames, strict=True):
+        arrays[f"jacobian-{n:04d}"] = frame.jacobian
     size = sum(array.nbytes for array in arrays.values())
     if size > MOST_BYTES:
         raise DataError(
@@ -119,7 +123,7 @@ def read_solution(path: Path, transit: Transit, *, threads: int = 1) -> Solution
         why = error.message
     except (zipfile.BadZipFile, EOFError, KeyError, MemoryError, ValueError, NotImplementedError) as error:
         why = str(error)
-    raise DataError("bad-solution", f"expected a kept solution of this transit, of file version 1: {why}")
+    raise DataError("bad-solution", f"expected a kept solution of this transit, of file version 2: {why}")
 
 
 def _array(archive: NpzFile, name: str, kind: type[Number], *shape: int | None) -> NDArray[Number]:
@@ -151,14 +155,17 @@ def _solution(archive: NpzFile, transit: Transit, threads: int) -> Solution:
     coordinates = _array(archive, "coordinates", np.float64, size)
     optics = Optics(total.kernel(coordinates), transit.shape, threads=threads)
     every, lanes = range(len(transit.frames)), optics.engine.lanes_shape
+    scenes = Scenes(len(every), lanes)
+    for n in every:
+        scenes[n] = _array(archive, f"scene-{n:04d}", np.float32, *lanes)
     sky = TransitScenes(
         transit,
-        scenes=[_array(archive, f"scene-{n:04d}", np.float32, *lanes) for n in every],
+        scenes=scenes,
         found=list(contents.found),
         dark=[_dark(archive, n, transit.shape) for n in every],
     )
     numbers = [_array(archive, name, np.float64, images).tolist() for name in _NUMBERS_OF_FRAMES]
-    lengths = ((size, size), (size,), (size,))
+    lengths = ((size, size), (size,))
     arrays = [
         _array(archive, name, np.float64, images, *of_one)
         for name, of_one in zip(_ARRAYS_OF_FRAMES, lengths, strict=True)
@@ -179,6 +186,7 @@ def _solution(archive: NpzFile, transit: Transit, threads: int) -> Solution:
                 pointing=transit.frames[n].pointing,
                 found=sky.found[n],
                 dark=sky.dark[n],
+                jacobian=_array(archive, f"jacobian-{n:04d}", np.float64, size, sky.dark[n][0].size),
                 **dict(zip(names, values, strict=True)),
             )
             for n, *values in zip(contents.part, *numbers, *arrays, strict=True)

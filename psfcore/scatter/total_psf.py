@@ -26,6 +26,12 @@ residual in the disc is then r = D [y - H (1 - D) G y]. The sum of the residual 
     t . r = b . n + (t . r without noise),   b = t - G^T (1 - D) H^T t                Eq. (3)
     cov(t_1 . r, t_2 . r) = sum over all pixels of b_1 b_2 var(n)                     Eq. (4)
 
+If the PSF changes, the expected light P H x in dark pixels P of a scene x that is 0 there changes as
+
+    P [1 - H (1 - P) G] (dH / dq) x                                                   Eq. (5)
+
+The second term of Eq. (5) is the change of the estimated scene, by Eq. (2).
+
 The first term of b describes the noise of the disc's pixels. The second term describes the noise of the estimated
 scene, which the model scatters into the disc.
 
@@ -52,21 +58,31 @@ from numpy.typing import NDArray
 
 from psfcore.arrays import Kernel, Matrix, Vector
 from psfcore.convolution.convolver import Convolver
-from psfcore.convolution.engine import BLOCK_ROWS, Engine
+from psfcore.convolution.engine import BLOCK_ROWS, Engine, aligned
 from psfcore.convolution.lengths import LANES
 from psfcore.deconvolve.assess.error_planes import sigma_points
-from psfcore.deconvolve.iterations.linear import inverse_filter, solve_linear, transfer_sample
+from psfcore.deconvolve.iterations.linear import (
+    LEAST_TRANSFER,
+    inverse_filter,
+    solve_linear,
+    transfer_sample,
+)
 from psfcore.errors import DataError
 from psfcore.noise import Noise
 from psfcore.psf import CURVE_RADII_PX, REACH_GRID_PX, FittedShape, Psf, encircled_energy
 from psfcore.psf_sampling import psf_for_image
 from psfcore.scatter.shapes import Shape, shape_named
-from psfcore.transit.transit import Frame
+from psfcore.transit.transit import Frame, Place
 
 DIFFRACTION, SCATTER = "DIFFRACTION", "SCATTER"
 Lanes = NDArray[np.float32]
 Pixels = tuple[NDArray[np.intp], NDArray[np.intp]]  # (rows, columns) of single pixels
 STEPS = 5
+# A step that changes a scene by less than this fraction (rms) leaves an error about fifty times smaller, which is the
+# rounding of float32 in the dark pixels. This holds for a PSF with at least LEAST_TRANSFER at all frequencies.
+SETTLED = 1e-3
+# Noise beyond this distance from a disc adds less than 1e-5 to the variance of sums over the disc.
+NOISE_REACH_PX = 200
 BLOCK_PX = 2**18  # of sums over all pixels: arrays of this size need little memory
 
 
@@ -89,6 +105,12 @@ class TotalPsf:
         self.shape = shape
         self.size = min(2 * max(field_shape), REACH_GRID_PX)
         self._convolver = Convolver(diffraction, (self.size, self.size), dtype=np.float64, threads=threads)
+
+    def of(self, shape: Shape) -> TotalPsf:
+        """The same computation for another shape."""
+        other = copy.copy(self)
+        other.shape = shape
+        return other
 
     def kernel(self, coordinates: Vector) -> Kernel:
         """The total PSF [y, x] at these coordinates of the shape."""
@@ -113,7 +135,10 @@ class TotalPsf:
 
     def curve_slopes(self, slopes: list[Kernel]) -> Matrix:
         """The derivatives of C(R) = 100 (1 - encircled energy), in percent: array (radii, coordinates)."""
-        return np.stack([-100 * encircled_energy(slope, self.radii_px) for slope in slopes], axis=1)
+        of_curve = np.empty((self.radii_px.size, len(slopes)))
+        for column, slope in zip(of_curve.T, slopes, strict=True):
+            column[:] = -100 * encircled_energy(slope, self.radii_px)
+        return of_curve
 
 
 def curve_sigma(slopes: Iterable[Kernel], covariance: Matrix, radii_px: Vector) -> Vector:
@@ -193,9 +218,9 @@ class Blur:
             twin.engine = self.engine.twin()
         return twins
 
-    def lanes(self, field: NDArray[np.floating]) -> Lanes:
-        """A field [y, x] rearranged into the engine's order."""
-        return self.engine.to_lanes(field)
+    def lanes(self, field: NDArray[np.floating], *, out: Lanes | None = None) -> Lanes:
+        """A field [y, x] rearranged into the engine's order, in `out` if it is given."""
+        return self.engine.to_lanes(field, out=out)
 
     def field(self, lanes: Lanes) -> NDArray[np.float32]:
         """The field [y, x], rearranged from the engine's order."""
@@ -210,11 +235,16 @@ class Blur:
         return self._through(lanes, self.engine.transfer, conjugate=True)
 
     def _through(self, lanes: Lanes, transfer: NDArray[np.float32], *, conjugate: bool = False) -> Lanes:
-        out = np.empty(self.engine.lanes_shape, np.float32)
         self.engine.rows_forward(lanes)
         self.engine.multiply_columns(transfer, conjugate=conjugate)
-        self.engine.rows_inverse(out)
-        if self._partly_filled:  # the last block also contains rows beyond the field; the field is dark there
+        return self._rows(0, self.engine.row_blocks)
+
+    def _rows(self, first: int, stop: int) -> Lanes:
+        """The field that the engine's spectrum contains, or some of its blocks of rows."""
+        out = np.empty((stop - first, *self.engine.lanes_shape[1:]), np.float32)
+        self.engine.rows_inverse(out, first)
+        if self._partly_filled and stop == self.engine.row_blocks:
+            # The last block also contains rows beyond the field; the field is dark there.
             rows = self.engine.field_shape[0] % BLOCK_ROWS
             out[-1, :, 0, min(rows, LANES) :] = 0.0
             out[-1, :, 1, max(rows - LANES, 0) :] = 0.0
@@ -236,7 +266,24 @@ class Optics(Blur):
     def __init__(self, psf_kernel: Kernel, field_shape: tuple[int, int], *, threads: int = 1) -> None:
         super().__init__(psf_kernel, field_shape, threads=threads)
         self._inverse = inverse_filter(self.engine)
+        self._fields: tuple[Lanes, Lanes] | None = None
         self.least_transfer = float(np.abs(transfer_sample(self.engine).values).min())
+
+    def twins(self) -> list[Self]:
+        """The same operator for each thread, each with its own working memory."""
+        twins = super().twins()
+        if len(twins) > 1:
+            for twin in twins:
+                twin._fields = None
+                _ = twin.fields
+        return twins
+
+    @property
+    def fields(self) -> tuple[Lanes, Lanes]:
+        """Working memory for two fields; it is kept, because memory that is taken for every image is left in pieces."""
+        if self._fields is None:
+            self._fields = aligned(*self.engine.lanes_shape), aligned(*self.engine.lanes_shape)
+        return self._fields
 
     def invert_once(self, lanes: Lanes, *, adjoint: bool = False) -> Lanes:
         """G y, or G^T y if `adjoint`."""
@@ -248,10 +295,48 @@ class Optics(Blur):
         Parameters
         ----------
         start
-            First estimate; default: the observation.
+            First estimate, which is overwritten; default: the observation.
         """
-        first = observed if start is None else start
-        return solve_linear(self.engine, self._inverse, observed, first, steps)  # Eq. (1)
+        first = observed.copy() if start is None else start
+        settled = SETTLED if self.least_transfer >= LEAST_TRANSFER else 0.0
+        return solve_linear(self.engine, self._inverse, observed, first, steps, settled=settled)  # Eq. (1)
+
+    def light_in(self, pixels: Pixels, scene: Lanes, slopes: Sequence[Blur] = ()) -> tuple[Vector, Matrix]:
+        """The light that a scene scatters into single pixels, and how it changes with the PSF, Eq. (5).
+
+        The result is that of `convolve` and `invert_once` one after the other, but the scene is transformed only once,
+        and fields are not written to memory. The derivatives have the shape (slopes, pixels).
+
+        Parameters
+        ----------
+        scene
+            The scene; it is 0 in the pixels.
+        slopes
+            Derivatives of the PSF, on an array of its size and for fields of the same shape.
+        """
+        engine = self.engine
+        if any(slope.engine.transfer.shape[:2] != engine.transfer.shape[:2] for slope in slopes):
+            raise ValueError("expected derivatives for the same fields, on an array of the size of the PSF")
+        blocks = pixels[0] // BLOCK_ROWS
+        first, stop = (int(blocks.min()), int(blocks.max()) + 1) if blocks.size else (0, 1)
+        here = pixels[0] - first * BLOCK_ROWS, pixels[1]
+        engine.rows_forward(scene)
+        engine.transform_columns()
+        engine.multiply_kept(engine.transfer)
+        light = pick(self._rows(first, stop), here)
+        responses = np.empty((len(slopes), light.size))
+        for k, slope in enumerate(slopes):
+            engine.multiply_kept(slope.engine.transfer)
+            changed = pick(self._rows(first, stop), here)
+            engine.rows_cut()
+            engine.multiply_columns(self._inverse)
+            around = self._rows(first, stop)
+            put(around, here, 0.0)
+            engine.rows_cut()
+            engine.rows_forward(around, first)
+            engine.multiply_columns(engine.transfer)
+            responses[k] = changed - pick(self._rows(first, stop), here)
+        return light, responses
 
 
 def pick(lanes: Lanes, pixels: Pixels) -> Vector:
@@ -267,6 +352,23 @@ def put(lanes: Lanes, pixels: Pixels, values: NDArray[np.floating] | float) -> N
 def _index(pixels: Pixels) -> tuple[NDArray[np.intp], ...]:
     rows, columns = pixels
     return rows // BLOCK_ROWS, columns, rows % BLOCK_ROWS // LANES, rows % LANES
+
+
+def around_disc(frame: Frame, dark: Pixels, shape: tuple[int, int]) -> tuple[Frame, Pixels]:
+    """The part of a frame around its dark pixels, inside the field; also these pixels in this part.
+
+    Parameters
+    ----------
+    shape
+        Shape (ny, nx) of the part, at most that of the frame.
+    """
+    y, x = (
+        int(np.clip(round(float(of_axis.mean())) - size // 2, 0, whole - size))
+        for of_axis, size, whole in zip(dark, shape, frame.pixels.shape, strict=True)
+    )
+    place = Place(frame.place.x_px - x, frame.place.y_px - y, frame.place.radius_px)
+    pixels = frame.pixels[y : y + shape[0], x : x + shape[1]]
+    return replace(frame, pixels=pixels, place=place, filled=None), (dark[0] - y, dark[1] - x)
 
 
 def noise_covariance(

@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -138,12 +139,13 @@ class FirstGuess:
         }
 
 
-def first_guess(transit: Transit) -> FirstGuess:
+def first_guess(transit: Transit, *, threads: int = 1) -> FirstGuess:
     """The first guess of a transit, with the positions of the occulter from the ephemeris.
 
     Raises DataError "no-first-guess" if no image shows the centre of the occulter in front of the Sun.
     """
-    guesses = [_frame_guess(frame) for frame in transit.frames]
+    with ThreadPoolExecutor(threads) as pool:
+        guesses = list(pool.map(_frame_guess, transit.frames))
     pointings = tuple(
         _pointing_guess(pointing, guesses) for pointing in sorted({guess.pointing for guess in guesses})
     )

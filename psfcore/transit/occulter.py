@@ -27,6 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +63,12 @@ DECONVOLUTION_NOISE = 2.3  # factor by which a deconvolution increases noise, fo
 LEAST_LEVEL = 1e-6
 _STRIPS = 32
 _DIFFERENCE_PX = 0.05
+
+
+class Windowed(Protocol):
+    """An array [y, x] of which windows can be read."""
+
+    def __getitem__(self, window: Window, /) -> NDArray[np.float32]: ...
 
 
 @dataclass(frozen=True)
@@ -122,9 +129,12 @@ def coverage(shape: tuple[int, int], place: Place) -> Plane:
 
 def fully_dark(shape: tuple[int, int], place: Place, margin_px: float = 0.0) -> NDArray[np.bool_]:
     """True for pixels [y, x] whose farthest corner is inside the disc by at least margin_px."""
-    y = np.abs(np.arange(shape[0]) - place.y_px)[:, None] + 0.5
-    x = np.abs(np.arange(shape[1]) - place.x_px)[None, :] + 0.5
-    return np.asarray(np.hypot(y, x) <= place.radius_px - margin_px)
+    rows, columns = patch_window(shape, place, max(-margin_px, 0.0))  # no pixel outside this window is inside
+    y = np.abs(np.arange(rows.start, rows.stop) - place.y_px)[:, None] + 0.5
+    x = np.abs(np.arange(columns.start, columns.stop) - place.x_px)[None, :] + 0.5
+    dark = np.zeros(shape, dtype=bool)
+    dark[rows, columns] = np.hypot(y, x) <= place.radius_px - margin_px
+    return dark
 
 
 def disc_distance(shape: tuple[int, int], place: Place) -> Plane:
@@ -178,7 +188,7 @@ def neighbours_of(index: int, frames: Sequence[Frame], places: Sequence[Place], 
 def find_occulter(
     index: int,
     frames: Sequence[Frame],
-    scene_of: Callable[[int], NDArray[np.float32]],
+    scene_of: Callable[[int], Windowed],
     places: Sequence[Place],
     psf_kernel: Plane,
     noise: Noise,
@@ -188,7 +198,7 @@ def find_occulter(
     Parameters
     ----------
     scene_of
-        Function of the index of a frame that returns the deconvolved frame [y, x], DN/s.
+        Function of the index of a frame that returns the deconvolved frame [y, x], DN/s; only a window of it is read.
     places
         The best known positions of the occulter in all frames; they decide which frames are neighbours.
     psf_kernel

@@ -34,6 +34,7 @@ FEWEST_SCALE_PIXELS = 100
 OCCULTER_MARGIN_PX = 5.0  # margin around the disc, for the error of the ephemeris and the blurred edge
 NEIGHBOUR_PX = 2  # half width of the window of the local median
 _CHUNK = 65_536
+_CHUNK_ROWS = 16
 
 Places = NDArray[np.intp]
 
@@ -119,10 +120,14 @@ def exposure_of(
             "no-exposure",
             f"{file}: expected XPOSURE or EXPTIME above 0 s in the header; got neither: add one of these keywords",
         )
-    rate = image.pixels * unit.scale / (1.0 if unit.kind == "rate" else image.exposure_s)
+    dn_per_unit = 1.0 if unit.kind == "rate" else image.exposure_s
+    pixels = np.empty(image.pixels.shape, np.float32)
     with np.errstate(over="ignore"):  # a value too large for float32 becomes infinite and so a gap
-        pixels = rate.astype(np.float32)
-    gaps = (image.mask != 0) | ~np.isfinite(pixels)
+        for first in range(0, len(pixels), _CHUNK_ROWS):  # whole planes would leave the cache
+            rows = slice(first, first + _CHUNK_ROWS)
+            pixels[rows] = image.pixels[rows] * unit.scale / dn_per_unit
+    gaps = ~np.isfinite(pixels)
+    gaps |= image.mask != 0
     return Exposure(
         file=file,
         pixels=pixels,

@@ -46,6 +46,7 @@ from psfcore.convolution.engine import (
     Engine,
     Lines,
     Single,
+    clear_beyond,
     rows_from_spectrum,
     rows_to_spectrum,
 )
@@ -123,7 +124,13 @@ def _all_rows(engine: Engine) -> int:
 
 
 def solve_linear(
-    engine: Engine, step_filter: NDArray[np.float32], observed: Single, start: Single, steps: int
+    engine: Engine,
+    step_filter: NDArray[np.float32],
+    observed: Single,
+    start: Single,
+    steps: int,
+    *,
+    settled: float = 0.0,
 ) -> Single:
     """The estimate x after some steps of Eq. (1), for an observation whose pixels are all trusted; in the engine's
     layout.
@@ -133,11 +140,13 @@ def solve_linear(
     Parameters
     ----------
     start
-        The first estimate.
+        The first estimate, which is overwritten by the result.
     step_filter
         The filter of a step, as for `Additive`.
+    settled
+        The iteration ends before `steps` if a step changes the estimate by less than this fraction (rms).
     """
-    x, rows = start.copy(), engine.field_shape[0]
+    x, rows = start, engine.field_shape[0]
     changes, sums = np.zeros((2, engine.row_blocks)), np.zeros(engine.row_blocks)
     rows_judged = np.zeros((engine.row_blocks, 2, LANES), np.float32)
     nothing = Judgement(rows_judged, 0, 0, 0, np.float32(0), np.float32(1), sums)
@@ -147,6 +156,8 @@ def solve_linear(
         engine.row_stage(_residual_rows, observed, nothing, rows)
         engine.multiply_columns(step_filter)
         engine.row_stage(_add_rows, x, left > 0, changes, rows)
+        if relative_change(*changes.sum(axis=1)) < settled:
+            break
     return x
 
 
@@ -213,7 +224,7 @@ def _residual_rows(
             if judgement.first <= i < judgement.last:
                 sum_here += sum_row
         judgement.sums[block] = sum_here
-        _clear_beyond(z, rows - block * 2 * LANES, nx)
+        clear_beyond(z, rows - block * 2 * LANES, nx)
         rows_to_spectrum(lines, block, nx)
 
 
@@ -242,15 +253,7 @@ def _add_rows(
             moved += moved_row
             total += total_row
         changes[0, block], changes[1, block] = moved, total
-        _clear_beyond(z, rows - block * 2 * LANES, nx)
-        _clear_beyond(x[block], rows - block * 2 * LANES, nx)
+        clear_beyond(z, rows - block * 2 * LANES, nx)
+        clear_beyond(x[block], rows - block * 2 * LANES, nx)
         if again:
             rows_to_spectrum(lines, block, nx)
-
-
-@compiled()
-def _clear_beyond(z: Single, rows: int, nx: int) -> None:
-    """Set the rows of a block beyond the number of rows to 0."""
-    for row in range(max(rows, 0), 2 * LANES):
-        for i in range(nx):
-            z[i, row // LANES, row % LANES] = np.float32(0.0)

@@ -295,10 +295,9 @@ def _disc_at(view: View, disc: DiscCells, rows: Sequence[int], changes: Sequence
     cells = cells_of(other.sky.dark[disc.index], place.x_px, place.y_px)
     if cells.pixels.size != disc.pixels.size:  # its outermost dark pixels moved
         return disc_with_jacobian(view, disc.index, changes)
-    residual, expected = other.residual(disc.index)
+    residual, expected, by_coordinates = other.residual_with_jacobian(disc.index, view.slopes)
     jacobian = disc.jacobian[list(rows)]
-    for k, slope in enumerate(view.slopes):
-        jacobian[k] = cells.weights @ other.jacobian(disc.index, slope)
+    jacobian[: len(by_coordinates)] = by_coordinates @ cells.weights.T
     return replace(
         disc,
         residual=cells.weights @ residual,

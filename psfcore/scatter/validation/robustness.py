@@ -48,6 +48,9 @@ from psfcore.transit.transit import Transit, folds
 
 OFFSETS_DN = (-5.0, -3.0, 3.0, 5.0)
 _RADII = 48
+TOGETHER = (
+    4  # parameters whose derivatives are computed in one pass over the images: each needs the memory of a PSF
+)
 BASE = len(SOFTENED_POWER_LAW.parameters)
 
 
@@ -193,32 +196,43 @@ def compare_shapes(
     if base.name != SOFTENED_POWER_LAW.name:
         raise DataError("unknown-shape", f"expected a fit of {SOFTENED_POWER_LAW.name}; got {base.name}")
     shapes = [shape for shape in SHAPES.values() if shape.name != base.name]
-    at, field_shape, threads = solution.inversion, solution.transit.shape, solution.threads
-    names: list[str] = []
-    blurs = [Blur(slope, field_shape, threads=threads) for slope in solution.total.slopes(at.coordinates)]
-    for shape in shapes:  # derivatives of the total PSF, at the solution of the power law
-        total = TotalPsf(solution.transit.diffraction, shape, field_shape, threads=threads)
-        for k, parameter in enumerate(shape.parameters[BASE:], start=BASE):
-            if parameter.name not in names:
-                names.append(parameter.name)
-                slope = total.slope(shape.coordinates(at.values), k)
-                blurs.append(Blur(slope, field_shape, threads=threads))
-
-    def equations(tool: tuple[Solution, list[Blur]], n: int) -> tuple[Matrix, Matrix]:
-        solution, blurs = tool
-        residual, expected = solution.residual(n)
-        jacobian = np.array([solution.jacobian(n, blur) for blur in blurs])
+    names = list(dict.fromkeys(name for shape in shapes for name in shape.names[BASE:]))
+    jacobians = [[frame.jacobian] for frame in solution.inversion.frames]
+    for first in range(0, len(names), TOGETHER):
+        found = _measured(solution, names[first : first + TOGETHER], progress)
+        for of_frame, (_, _, jacobian) in zip(jacobians, found, strict=True):
+            of_frame.append(jacobian)
+    normals, scores = [], []
+    for n, of_frame, (residual, expected, _) in zip(solution.part, jacobians, found, strict=True):
+        jacobian = np.concatenate(of_frame)
         weighted = jacobian * solution.weight(n, expected)
-        return weighted @ jacobian.T, weighted @ residual
-
-    tools = list(zip(solution.twins(), map(list, zip(*(b.twins() for b in blurs), strict=True)), strict=True))
-    count = len(solution.part)
-    found = on_threads(
-        equations, solution.part, tools, lambda step: progress("comparing shapes", step, count)
-    )
-    normal, score = (np.array(part) for part in zip(*found, strict=True))
+        normals.append(weighted @ jacobian.T)
+        scores.append(weighted @ residual)
+    normal, score = np.array(normals), np.array(scores)
     added = [[BASE + names.index(name) for name in shape.names[BASE:]] for shape in shapes]
     return tuple(_compared(shape, of, normal, score) for shape, of in zip(shapes, added, strict=True))
+
+
+def _measured(
+    solution: Solution, names: Sequence[str], progress: Progress
+) -> list[tuple[Vector, Vector, Matrix]]:
+    """For every image: residual, expected intensity, and derivatives with respect to parameters that the power law does
+    not have.
+    """
+
+    def slope_of(name: str) -> Blur:
+        shape = next(shape for shape in SHAPES.values() if name in shape.names)
+        at = shape.coordinates(solution.inversion.values)
+        slope = solution.total.of(shape).slope(at, shape.names.index(name))
+        return Blur(slope, solution.transit.shape, threads=solution.threads)
+
+    blurs, count = [slope_of(name) for name in names], len(solution.part)
+    return on_threads(
+        lambda solution, n: solution.residual_with_jacobian(n, blurs),
+        solution.part,
+        solution.twins(),
+        lambda step: progress("comparing shapes", step, count),
+    )
 
 
 def _compared(shape: Shape, extra: list[int], normal: Matrix, score: Matrix) -> ComparedShape:

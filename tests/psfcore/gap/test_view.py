@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -24,9 +23,9 @@ def test_a_scene_has_the_brightness_of_its_own_image() -> None:
     assert of_one == pytest.approx(of_next, rel=2e-3)
     # An image without light has a dark scene; a negative sum of light is no brightness, and nothing is divided by zero.
     for of_one, of_others in ((0.0, 1.0), (-1.0, 1.0), (1.0, 0.0)):
-        sky = copy(solution().sky)
-        factors = [of_one if n == 1 else of_others for n in range(len(sky.scenes))]
-        sky.scenes = [np.float32(by) * scene for by, scene in zip(factors, sky.scenes, strict=True)]
+        sky = solution().sky.copy()
+        for n, scene in enumerate(solution().sky.scenes):
+            sky.scenes[n] = np.float32(of_one if n == 1 else of_others) * scene
         scene = View(replace(solution(), sky=sky)).scenes[1]
         assert np.abs(scene).max() < 1e-6 * np.abs(view.scenes[1]).max(), (of_one, of_others)
 

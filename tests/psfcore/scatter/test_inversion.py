@@ -226,7 +226,7 @@ def test_eq_4_is_what_a_change_of_the_psf_does() -> None:
     for n, k in itertools.product((0, 5), range(at.size)):
         step = 0.02 * np.eye(at.size)[k]
         ahead, behind = (expected_with(solution, n, at + side * step) for side in (1, -1))
-        found = solution.jacobian(n, Blur(slopes[k], solution.transit.shape))
+        _, _, (found,) = solution.residual_with_jacobian(n, [Blur(slopes[k], solution.transit.shape)])
         expected = (ahead - behind) / 0.04
         assert np.linalg.norm(found - expected) < 0.02 * np.linalg.norm(expected)
 

@@ -9,11 +9,24 @@ import pytest
 from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import Convolver, linear_convolve
+from psfcore.deconvolve.iterations.linear import inverse_filter, solve_linear
+from psfcore.noise import Noise
 from psfcore.psf import CURVE_RADII_PX, REACH_GRID_PX, cumulative_curve
 from psfcore.scatter.power_law import scatter_kernel
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW
-from psfcore.scatter.total_psf import Blur, Optics, TotalPsf, pick, put
+from psfcore.scatter.total_psf import (
+    NOISE_REACH_PX,
+    Blur,
+    Optics,
+    TotalPsf,
+    around_disc,
+    noise_covariance,
+    pick,
+    put,
+)
 from psfcore.simulate.scatter_truth import ScatterTruth, total_kernel
+from psfcore.transit.occulter import fully_dark
+from psfcore.transit.transit import Frame, Place
 from tests.psfcore.small_transits import DIFFRACTION, SCATTER
 
 AT = SOFTENED_POWER_LAW.coordinates({"b_px": 6.15, "c": 2.53, "total": 0.411})
@@ -115,10 +128,70 @@ def test_inversion_recovers_the_scene() -> None:
         observed = optics.lanes(Convolver(kernel, shape, dtype=np.float64).apply(x))
         off = {n: np.abs(optics.field(optics.invert(observed, steps=n)) - x).max() for n in (0, 1, 2, 5, 8)}
         assert off[0] > 500
-        assert off[8] < off[5] < off[2] < off[1]
+        assert off[8] == off[5] <= off[2] < off[1], "it ends when it is settled"
         assert off[5] < 0.5
         nearly = optics.invert(observed, optics.lanes(x + 1.0), steps=3)
         np.testing.assert_allclose(optics.field(nearly), x, atol=0.1)
+
+
+def test_a_settled_scene_scatters_the_light_of_one_with_many_steps() -> None:
+    kernel = total_kernel(SCATTER, DIFFRACTION, 280)
+    for shape in FIELDS[:2]:
+        optics = Optics(kernel, shape)
+        observed, pixels = optics.lanes(scene(shape)), np.nonzero(np.eye(*shape))
+        many = solve_linear(optics.engine, inverse_filter(optics.engine), observed, observed.copy(), 20)
+        settled, exact = (
+            pick(optics.convolve(scene), pixels) for scene in (optics.invert(observed, steps=20), many)
+        )
+        np.testing.assert_allclose(settled, exact, rtol=1e-4)
+
+
+def test_light_in_pixels_is_that_of_whole_fields() -> None:
+    """Eq. (5), one operator after the other."""
+    kernel = total_kernel(SCATTER, DIFFRACTION, 200)
+    slopes = [kernel - LOPSIDED, LOPSIDED * np.indices(LOPSIDED.shape)[1] / 200]
+    for shape in FIELDS:
+        optics, blurs = Optics(kernel, shape), [Blur(slope, shape) for slope in slopes]
+        disc = np.hypot(*(np.indices(shape) - np.array(shape)[:, None, None] + 11)) < 10  # near the last row
+        pixels, x = np.nonzero(disc), scene(shape) * ~disc
+        lanes = optics.lanes(x)
+        expected = pick(optics.convolve(lanes), pixels)
+        for twin in (optics, *Optics(kernel, shape, threads=2).twins()):
+            found, responses = twin.light_in(pixels, lanes, blurs)
+            np.testing.assert_allclose(found, expected, rtol=1e-5)
+            for response, blur in zip(responses, blurs, strict=True):
+                changed = blur.convolve(lanes)
+                estimated = optics.invert_once(changed)
+                put(estimated, pixels, 0.0)
+                by_hand = pick(changed, pixels) - pick(optics.convolve(estimated), pixels)
+                scale = np.abs(pick(changed, pixels)).max()
+                np.testing.assert_allclose(response, by_hand, atol=1e-5 * scale)
+        np.testing.assert_array_equal(optics.field(lanes), x.astype(np.float32))
+        nothing = (np.zeros(0, np.intp), np.zeros(0, np.intp))
+        assert optics.light_in(nothing, lanes, blurs)[1].shape == (2, 0)
+        with pytest.raises(ValueError, match="derivatives"):
+            optics.light_in(pixels, lanes, [Blur(kernel, (300, 300))])
+
+
+def test_noise_far_from_a_disc_adds_nothing() -> None:
+    """Also if the field ends near the disc."""
+    size, reach = 2 * NOISE_REACH_PX + 160, NOISE_REACH_PX + 11
+    field, part = (size, size), (2 * reach, 2 * reach)
+    kernel = TotalPsf(DIFFRACTION, SOFTENED_POWER_LAW, field).kernel(AT)
+    optics, near = Optics(kernel, field), Optics(kernel, part)
+    for place in (Place(280.2, 285.0, 10.75), Place(14.0, 300.0, 10.75)):
+        dark = np.nonzero(fully_dark(field, place))
+        pixels = 200 * (1 + np.indices(field)[1] / 100).astype(np.float32)
+        pixels[dark] *= 0.02
+        frame = Frame("a", pixels, 1, place, 1.0, 0.0)
+        templates = [np.full(dark[0].size, 1 / dark[0].size), (dark[0] - place.y_px) / dark[0].size]
+        whole = noise_covariance(optics, frame, dark, templates, Noise(6.0, 2.0))
+        cut, here = around_disc(frame, dark, part)
+        assert cut.pixels.shape == part
+        np.testing.assert_array_equal(cut.pixels[here], pixels[dark])
+        found = noise_covariance(near, cut, here, templates, Noise(6.0, 2.0))
+        size_of = np.sqrt(np.diag(whole))
+        np.testing.assert_allclose(found, whole, rtol=0, atol=2e-5 * np.outer(size_of, size_of).min())
 
 
 def test_single_pixels_are_the_right_ones() -> None:

@@ -201,7 +201,7 @@ def test_the_pointings_of_the_first_line_hold_most_of_the_gap() -> None:
     )[0]
     told = [int(one) for one in last.split(" and ")]
     assert set(told) == set(list(shares)[: len(told)]) and len(told) < len(shares)
-    assert int(percent) == round(100 * sum(shares[one] for one in told)) >= 60
+    assert int(percent) == min(round(100 * sum(shares[one] for one in told)), 99) >= 60  # "> 99 %"
 
 
 def test_few_images_and_a_gap_of_the_unocculted_field() -> None:

@@ -75,8 +75,7 @@ def test_gains_agree_with_the_residuals() -> None:
     blurs = [Blur(slope, solution.transit.shape) for slope in slopes]
     frames = []
     for n in solution.part:
-        residual, expected = solution.residual(n)
-        jacobian = np.array([solution.jacobian(n, blur) for blur in blurs])
+        residual, expected, jacobian = solution.residual_with_jacobian(n, blurs)
         frames.append((residual, jacobian, solution.weight(n, expected)))
 
     def step(of: list[int], size: int) -> np.ndarray:
@@ -107,7 +106,8 @@ def bend_slope(solution: Solution) -> np.ndarray:
 
 
 def test_few_images_have_no_held_out_gain_and_other_shapes_are_refused() -> None:
-    few = dataclasses.replace(solved(), part=solved().part[3:8])
+    five = dataclasses.replace(solved().inversion, frames=solved().inversion.frames[3:8])
+    few = dataclasses.replace(solved(), part=solved().part[3:8], inversion=five)
     inversion = dataclasses.replace(solved().inversion, shape=SHAPES["knee"])
     with patch.object(robustness, "SHAPES", {"knee": SHAPES["knee"]}):
         assert all(shape.held_out_gain is None for shape in compare_shapes(few))
@@ -142,8 +142,8 @@ def test_slopes_are_those_of_the_inversion() -> None:
     for shell in (0, 3, 8, 15, 22):
         blur = shell_blur(solution, shell)
         for k, n in list(enumerate(solution.part))[::4]:
-            residual, expected = solution.residual(n)
-            slope, weight = solution.jacobian(n, blur), solution.weight(n, expected)
+            residual, expected, (slope,) = solution.residual_with_jacobian(n, [blur])
+            weight = solution.weight(n, expected)
             normal = float(weight @ slope**2)
             # The derivatives agree to a tenth, and the score to a tenth of its noise.
             assert shares().normal[k, shell, shell] == pytest.approx(normal, rel=0.2)
