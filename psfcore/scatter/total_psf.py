@@ -163,8 +163,10 @@ def possible_psfs(psf: Psf, *, threads: int = 1) -> list[Psf]:
 
 
 def possible_on_pixels(psf: Psf, header: Header, *, threads: int = 1) -> list[Psf]:
-    """The PSFs of `possible_psfs` on the pixels of an image; empty if the errors of the PSF are not known."""
-    if psf.fitted is None:
+    """The PSFs of `possible_psfs` on the pixels of an image; empty if the errors of the PSF are not known, as those of
+    the terms of a PSF that changes over the field.
+    """
+    if psf.fitted is None or psf.field_terms:
         return []
     return [psf_for_image(one, header) for one in possible_psfs(psf, threads=threads)]
 

@@ -163,7 +163,7 @@ def show(file: Path, plot: Path | None, overwrite: bool) -> None:
     import numpy as np
 
     from psfcore.fits.psfs import read_psf
-    from psfcore.psf import cumulative_curve
+    from psfcore.psf import cumulative_curve, light_beyond_map
 
     psf = read_psf(file, psf_limits())
     if plot is not None:
@@ -185,6 +185,17 @@ def show(file: Path, plot: Path | None, overwrite: bool) -> None:
     echo(f"{'R (px)':>8}" + "".join(f"{name:>15}" for name in kernels))
     for n, radius in enumerate(radii):
         echo(f"{radius:>8g}" + "".join(f"{curve[n]:>15.3f}" for curve in curves.values()))
+    if psf.place is None:
+        return
+    terms = ", ".join(f"x^{term.x_power} y^{term.y_power}" for term in psf.field_terms)
+    nx, ny = psf.place.detector
+    echo(
+        f"\nchanges over the field of {nx} x {ny} px (terms {terms}); above: at its centre\n"
+        "light beyond R in percent at the corners, the edges and the centre, y upwards:"
+    )
+    for radius, places in zip(radii, light_beyond_map(psf, radii), strict=True):
+        for n, row in enumerate(places[::-1]):
+            echo((f"{radius:>8g}" if n == 0 else " " * 8) + "".join(f"{pct:>10.3f}" for pct in row))
 
 
 def _mask_of(instrument: str, folder: str) -> Path | None:
