@@ -95,7 +95,7 @@ def fit_places(given: Sequence[PlacedPsf], detector: tuple[int, int], *, order: 
     shape = tuple(max(one.psf.kernel.shape[axis] for one in given) for axis in (0, 1))
     kernels = np.array([_placed(one.psf.kernel, (shape[0], shape[1])) for one in given])
     planes = np.tensordot(np.linalg.pinv(factors), kernels, 1)  # Eq. (1)
-    clipped = _lift(planes, powers)
+    clipped = raise_to_zero(planes, powers)
     found = np.tensordot(factors, planes, 1)
     misplaced = tuple(float(np.abs(one - other).sum() / 2) for one, other in zip(found, kernels, strict=True))
     terms = tuple(FieldTerm(plane, a, b) for plane, (a, b) in zip(planes[1:], powers, strict=True))
@@ -174,7 +174,7 @@ def _placed(kernel: Kernel, shape: tuple[int, int]) -> Kernel:
     return cut(kernel, kernel.shape[0] // 2 - shape[0] // 2, kernel.shape[1] // 2 - shape[1] // 2, shape)
 
 
-def _lift(planes: Matrix, powers: Sequence[Powers]) -> float:
+def raise_to_zero(planes: Matrix, powers: Sequence[Powers]) -> float:
     """Change the planes K0 and K_m so that no weight is below 0 on the detector; returns the share of the light that
     was below 0 at the worst place.
 

@@ -42,8 +42,9 @@ scene, which the model scatters into the disc.
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Self
 
 import numpy as np
@@ -55,6 +56,7 @@ from psfcore.convolution.convolver import Convolver
 from psfcore.convolution.engine import BLOCK_ROWS, Engine
 from psfcore.convolution.lanes import LANES
 from psfcore.deconvolve.assess.error_planes import sigma_points
+from psfcore.deconvolve.conditions import new_engine
 from psfcore.deconvolve.iterations.linear import inverse_filter, solve_linear, transfer_sample
 from psfcore.errors import DataError
 from psfcore.noise import Noise
@@ -179,11 +181,16 @@ class Blur:
     Parameters
     ----------
     kernel
-        Values [y, x] of any sign, centre at [n // 2, n // 2].
+        Values [y, x] of any sign, centre at [n // 2, n // 2]; or a PSF on the pixels of the field, which may change
+        over the field.
     """
 
-    def __init__(self, kernel: Kernel, field_shape: tuple[int, int], *, threads: int = 1) -> None:
-        self.engine = Engine(kernel, field_shape, threads=threads)
+    def __init__(self, kernel: Kernel | Psf, field_shape: tuple[int, int], *, threads: int = 1) -> None:
+        self.engine = (
+            new_engine(kernel, field_shape, field_shape, threads)
+            if isinstance(kernel, Psf)
+            else Engine(kernel, field_shape, threads=threads)
+        )
         self._partly_filled = field_shape[0] % BLOCK_ROWS != 0
 
     def twins(self) -> list[Self]:
@@ -205,16 +212,16 @@ class Blur:
 
     def convolve(self, lanes: Lanes) -> Lanes:
         """H x: the field convolved with the kernel."""
-        return self._through(lanes, self.engine.transfer)
+        return self._through(lanes, partial(self.engine.columns, adjoint=False))
 
     def correlate(self, lanes: Lanes) -> Lanes:
         """H^T y: the field correlated with the kernel. This is the adjoint of `convolve`."""
-        return self._through(lanes, self.engine.transfer, conjugate=True)
+        return self._through(lanes, partial(self.engine.columns, adjoint=True))
 
-    def _through(self, lanes: Lanes, transfer: NDArray[np.float32], *, conjugate: bool = False) -> Lanes:
+    def _through(self, lanes: Lanes, columns: Callable[[], None]) -> Lanes:
         out = np.empty(self.engine.lanes_shape, np.float32)
         self.engine.rows_forward(lanes)
-        self.engine.multiply_columns(transfer, conjugate=conjugate)
+        columns()
         self.engine.rows_inverse(out)
         if self._partly_filled:  # the last block also contains rows beyond the field; the field is dark there
             rows = self.engine.field_shape[0] % BLOCK_ROWS
@@ -235,14 +242,14 @@ class Optics(Blur):
         The smallest absolute value of the PSF's Fourier transform.
     """
 
-    def __init__(self, psf_kernel: Kernel, field_shape: tuple[int, int], *, threads: int = 1) -> None:
+    def __init__(self, psf_kernel: Kernel | Psf, field_shape: tuple[int, int], *, threads: int = 1) -> None:
         super().__init__(psf_kernel, field_shape, threads=threads)
         self._inverse = inverse_filter(self.engine)
         self.least_transfer = float(np.abs(transfer_sample(self.engine).values).min())
 
     def invert_once(self, lanes: Lanes, *, adjoint: bool = False) -> Lanes:
         """G y, or G^T y if `adjoint`."""
-        return self._through(lanes, self._inverse, conjugate=adjoint)
+        return self._through(lanes, partial(self.engine.multiply_columns, self._inverse, conjugate=adjoint))
 
     def invert(self, observed: Lanes, start: Lanes | None = None, *, steps: int = STEPS) -> Lanes:
         """The scene x of an observation, from `steps` iterations of Eq. (1).

@@ -86,7 +86,7 @@ TOLD_PX = (10, 100)  # the JSON and `psf show` have the curve at more radii
 @click.option("-o", "--output", required=True, type=OUTPUT, help="Write the PSF (FITS)")
 @JSON
 @PLOT
-@options_of(PsfFit, "shape", "as_published", "noise", "saturation_dn")
+@options_of(PsfFit, "shape", "field", "as_published", "noise", "saturation_dn")
 @SERVER_OR_LOCAL
 @writes_files
 def fit(
@@ -109,6 +109,8 @@ def fit(
     found = fitted["details"]["fit"]
     echo(f"{output}: {title(fitted['name'], fitted['version'], fitted['status'])}, id {short(fitted['id'])}")
     say_fit(found)
+    for line in found.get("field", {}).get("lines", ()):
+        echo(f"  {line}")
     for limit in found["limits"]:
         echo(f"  note: {limit}")
     here = " --local" if is_local() else ""
