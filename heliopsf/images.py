@@ -333,7 +333,9 @@ def _source_of(
     instrument = instrument_named(psf)
     if instrument is None:
         own = given_psf(psf, threads=threads, progress=None)
-        return source(lambda *_: own, key=id(own), kernel_shape=own.kernel.shape)
+        return source(
+            lambda *_: own, key=id(own), kernel_shape=own.kernel.shape, field_terms=len(own.field_terms)
+        )
     return source(
         lambda _, progress: given_psf(psf, threads=threads, progress=progress),
         key=instrument.name,

@@ -319,7 +319,11 @@ def used_psf(psf: Psf) -> UsedPsf:
     """
     identity = psf.provenance.get("psf_id")
     if identity is None:  # weights in memory
-        identity = hashlib.sha256(f"{psf.kernel.shape}".encode() + psf.kernel.tobytes()).hexdigest()
+        content = hashlib.sha256(f"{psf.kernel.shape}".encode() + psf.kernel.tobytes())
+        for term in psf.field_terms:
+            content.update(f"{term.kernel.shape} {term.x_power} {term.y_power} {psf.place}".encode())
+            content.update(term.kernel.tobytes())
+        identity = content.hexdigest()
     return UsedPsf(str(identity), psf.name, psf.version, psf.status)
 
 

@@ -96,12 +96,16 @@ class Psf(Shown, CorePsf):
         Texts of the cards TELESCOP, INSTRUME, DETECTOR and FILTER: the images for which the PSF is valid.
     turn_deg : float, optional
         Angle from the +x axis of the detector to that of the kernel, degrees.
+    field_terms : tuple of psfcore.psf_field.FieldTerm, optional
+        The terms of a PSF that changes over the field; the kernel is then that of the centre of the detector.
+    place : psfcore.psf_field.Place, optional
+        Where the pixels lie on the detector; required if there are terms.
 
     Raises
     ------
     DataError
-        "psf-not-2d", "psf-too-small", "psf-nonfinite", "psf-negative", "psf-sum", "psf-not-centred" or
-        "psf-off-centre".
+        "psf-not-2d", "psf-too-small", "psf-nonfinite", "psf-negative", "psf-sum", "psf-not-centred",
+        "psf-off-centre" or "psf-field".
     """
 
     def light_beyond(self, radii: ArrayLike | units.Quantity) -> NDArray[np.generic]:

@@ -12,7 +12,7 @@ away. A smaller array holds the part of the light that falls on it; its sum is b
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from psfcore.arrays import cut
 from psfcore.errors import DataError
 from psfcore.instruments.files import PLATE_SCALE_TOLERANCE as PLATE_SCALE_TOLERANCE
+from psfcore.psf_field import FieldTerm, Place, check_field, kernel_at, nine_places
 from psfcore.recipe import REACH_GRID_PX as REACH_GRID_PX
 
 SHOWN_RADII_PX = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
@@ -63,7 +64,7 @@ class Psf:
     """The weights [y, x] of a PSF, and how they were obtained.
 
     Raises DataError: "psf-not-2d", "psf-too-small", "psf-nonfinite", "psf-negative", "psf-sum", "psf-not-centred",
-    "psf-off-centre".
+    "psf-off-centre", "psf-field".
 
     Attributes
     ----------
@@ -80,6 +81,11 @@ class Psf:
         The angle from the +x axis of the detector to the +x axis of the kernel.
     cards
         Texts of the file's cards TELESCOP, INSTRUME, DETECTOR and FILTER, which say for which images the PSF is valid.
+    field_terms
+        The terms of a PSF that changes over the field (`psfcore.psf_field`); `kernel` is then K0.
+    place
+        Where the pixels of the image lie on the detector; required if there are terms. In a file: those of the whole
+        detector.
     """
 
     kernel: Kernel
@@ -94,12 +100,16 @@ class Psf:
     fitted: FittedShape | None = None
     cards: Mapping[str, str] = field(default_factory=dict)
     turn_deg: float = 0.0
+    field_terms: tuple[FieldTerm, ...] = ()
+    place: Place | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "kernel", np.ascontiguousarray(self.kernel, dtype=np.float64))
         _check_weights(self.kernel)
         _check_centre(self.kernel)
         _check_core(self.kernel)
+        if self.field_terms:
+            check_field(self.kernel, self.field_terms, self.place, (SMALLEST_SUM, LARGEST_SUM))
 
     @property
     def total(self) -> float:
@@ -111,6 +121,21 @@ class Psf:
         """Distance of the farthest pixel from the centre, px."""
         ny, nx = self.kernel.shape
         return float(np.hypot(ny // 2, nx // 2))
+
+    def at(self, u: float, v: float) -> Kernel:
+        """Compute the weights for light from a place of the detector.
+
+        Parameters
+        ----------
+        u, v : float
+            The place along x and y, from -1 to 1: the first and the last pixel of the detector.
+
+        Returns
+        -------
+        ndarray of float64
+            The weights [y, x]; those of every place if the PSF does not change over the field.
+        """
+        return kernel_at(self.kernel, self.field_terms, u, v)
 
 
 def _check_weights(kernel: Kernel) -> None:
@@ -210,6 +235,21 @@ def crop_centred(kernel: Kernel, shape: tuple[int, int]) -> Kernel:
     return kernel[top : top + ny, left : left + nx].copy()
 
 
+def psf_from_pixel(psf: Psf, x_px: int, y_px: int) -> Psf:
+    """The PSF of the part of an image that begins at the pixel (x_px, y_px); `psf` itself if it has no place."""
+    return psf if psf.place is None else replace(psf, place=psf.place.from_pixel(x_px, y_px))
+
+
+def with_kernels(psf: Psf, change: Callable[[Kernel], Kernel]) -> Psf:
+    """The PSF whose kernel, components and terms are changed by a linear function."""
+    return replace(
+        psf,
+        kernel=change(psf.kernel),
+        components={name: change(part) for name, part in psf.components.items()},
+        field_terms=tuple(replace(term, kernel=change(term.kernel)) for term in psf.field_terms),
+    )
+
+
 def central_part(psf: Psf, size_px: int) -> Psf:
     """The central (size_px, size_px) px of a PSF and of its components. The weights are not renormalised.
 
@@ -218,12 +258,7 @@ def central_part(psf: Psf, size_px: int) -> Psf:
     smallest = min(psf.kernel.shape)
     if size_px > smallest:
         raise DataError("cutout-too-large", f"expected a size of 1 to {smallest} px; got {size_px}")
-    shape = (size_px, size_px)
-    return replace(
-        psf,
-        kernel=crop_centred(psf.kernel, shape),
-        components={name: crop_centred(part, shape) for name, part in psf.components.items()},
-    )
+    return with_kernels(psf, lambda kernel: crop_or_pad(kernel, size_px))
 
 
 def crop_or_pad(kernel: Kernel, size: int) -> Kernel:
@@ -262,6 +297,32 @@ def light_beyond_pct(kernel: Kernel) -> dict[str, float]:
     """The light beyond each of SHOWN_RADII_PX in percent, by the radius as text."""
     curve = cumulative_curve(kernel, np.array(SHOWN_RADII_PX, dtype=float))
     return {str(radius): float(pct) for radius, pct in zip(SHOWN_RADII_PX, curve, strict=True)}
+
+
+def light_beyond_map(psf: Psf, radii_px: ArrayLike) -> NDArray[np.float64]:
+    """The light beyond each R (px) in percent at nine places of the detector, (radii, 3, 3): v and u are -1, 0, 1.
+
+    The light is that of `cumulative_curve`, which is linear in the weights.
+    """
+    encircled = [
+        encircled_energy(one, radii_px) for one in (psf.kernel, *(t.kernel for t in psf.field_terms))
+    ]
+    factors = [[1.0, *(term.at(u, v) for term in psf.field_terms)] for u, v in nine_places()]
+    beyond = 1.0 - np.transpose(encircled) @ np.transpose(factors)
+    return np.asarray(100.0 * np.maximum(beyond, 0.0).reshape(-1, 3, 3))
+
+
+def field_map(psf: Psf) -> dict[str, object]:
+    """How a PSF changes over the field, as JSON values: the powers of its terms, the size of the detector, and the maps
+    of `light_beyond_map` for SHOWN_RADII_PX.
+    """
+    assert psf.place is not None
+    return {
+        "terms": [[term.x_power, term.y_power] for term in psf.field_terms],
+        "detector_px": list(psf.place.detector),
+        "radii_px": list(SHOWN_RADII_PX),
+        "light_beyond_pct": light_beyond_map(psf, SHOWN_RADII_PX).tolist(),
+    }
 
 
 def radial_profile(kernel: Kernel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

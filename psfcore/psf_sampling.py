@@ -11,9 +11,10 @@ other words, K is the share of a point source's light that a binned pixel of the
 positions of the source within a binned pixel of the scene. The sum of t(n M + d) over M is 1 for each d, so no light is
 lost. A delta function stays a delta function.
 
-A cut-out, or a window that starts at another pixel of the detector (PXBEG), has the same PSF as the whole image,
-because one PSF is used for the whole field: only the difference of two positions matters. Near the edges of a window,
-light from outside the window enters the image; no choice of the PSF can correct this.
+A cut-out, or a window that starts at another pixel of the detector (PXBEG), has the same PSF as the whole image, if
+one PSF is used for the whole field: only the difference of two positions matters. A PSF that changes over the field
+(`psfcore.psf_field`) needs the place of the pixels on the detector. Near the edges of a window, light from outside the
+window enters the image; no choice of the PSF can correct this.
 
 If the image was turned by quarter turns or flipped after it was taken, so is the PSF of its detector, which is exact.
 Its core and its arms are too narrow to be interpolated, so for other angles a PSF is built anew from the instrument
@@ -39,8 +40,10 @@ from psfcore.errors import DataError
 from psfcore.fits.cards import Cards
 from psfcore.fits.channel import PsfOrigin, binning_factor
 from psfcore.fits.frame import SILENT_DEG, UNIT, Matrix, frame_of, plate_scale_arcsec
+from psfcore.fits.place import place_of
 from psfcore.image import Image
-from psfcore.psf import LARGEST_SUM, PLATE_SCALE_TOLERANCE, REACH_GRID_PX, Psf, crop_centred
+from psfcore.psf import LARGEST_SUM, PLATE_SCALE_TOLERANCE, REACH_GRID_PX, Psf, crop_centred, with_kernels
+from psfcore.psf_field import FieldTerm, Place
 
 LARGEST_FACTOR = 64
 Kernel = NDArray[np.float64]
@@ -49,14 +52,18 @@ Scaled = TypeVar("Scaled", Psf, PsfOrigin)
 
 @dataclass(frozen=True)
 class Sampling:
-    """The pixels of an image, as a PSF needs them: the binning factor, and the quarter turn or flip of the detector."""
+    """The pixels of an image, as a PSF needs them: the binning factor, the quarter turn or flip of the detector, and
+    for a PSF that changes over the field the place on the detector.
+    """
 
     factor: int
     turn: Matrix
+    place: Place | None = None
 
     def of(self, psf: Psf) -> Psf:
         """The PSF on these pixels."""
-        return turned(rebinned(psf, self.factor), self.turn)
+        fitted = turned(rebinned(psf, self.factor), self.turn)
+        return fitted if self.place is None else replace(fitted, place=self.place)
 
 
 def with_scale(psf: Scaled, plate_scale_arcsec: float | None) -> Scaled:
@@ -75,12 +82,22 @@ def with_scale(psf: Scaled, plate_scale_arcsec: float | None) -> Scaled:
 AS_BUILT = Sampling(1, UNIT)
 
 
-def sampling_of(psf: Psf, header: Cards) -> Sampling:
-    """How an image samples a PSF of its detector. Raises DataError "plate-scale-mismatch"."""
-    turn = frame_of(header).quarter_turns
-    if turn is None or psf.instrument is None or psf.turn_deg != 0:
-        turn = UNIT
-    return Sampling(binning_factor(psf, header), turn)
+def sampling_of(psf: Psf, header: Cards, shape: tuple[int, int] | None = None) -> Sampling:
+    """How an image samples a PSF of its detector. Raises DataError "plate-scale-mismatch", and "psf-place" if the PSF
+    changes over the field and the place of the image is not known.
+
+    Parameters
+    ----------
+    shape
+        Shape (ny, nx) of the image; None: as the header says.
+    """
+    turn = UNIT if psf.instrument is None or psf.turn_deg != 0 else frame_of(header).quarter_turns
+    factor = binning_factor(psf, header)
+    place = None
+    if psf.place is not None:
+        place = place_of(header, shape, psf.place.detector, factor, turn)
+        place = None if place == psf.place else place
+    return Sampling(factor, turn or UNIT, place)
 
 
 def psf_for_image(psf: Psf, header: Header) -> Psf:
@@ -100,11 +117,14 @@ def turned(psf: Psf, turn: Matrix) -> Psf:
     """
     if turn == UNIT:
         return psf
+    found = with_kernels(psf, lambda kernel: _turned(kernel, turn))
+    terms = found.field_terms
+    if turn[0][0] == 0:  # x of the detector is y of the image
+        terms = tuple(FieldTerm(term.kernel, term.y_power, term.x_power) for term in terms)
     return replace(
-        psf,
-        kernel=_turned(psf.kernel, turn),
+        found,
+        field_terms=terms,
         version=f"{psf.version}+turned",
-        components={name: _turned(part, turn) for name, part in psf.components.items()},
         provenance={**psf.provenance, "turned": str(turn)},
     )
 
@@ -190,12 +210,11 @@ def rebinned(psf: Psf, factor: int) -> Psf:
         )
     scale = psf.plate_scale_arcsec
     return replace(
-        psf,
-        kernel=rebinned_kernel(psf.kernel, factor),
+        with_kernels(psf, lambda kernel: rebinned_kernel(kernel, factor)),
         version=f"{psf.version}+bin{factor}",
         plate_scale_arcsec=None if scale is None else scale * factor,
-        components={name: rebinned_kernel(part, factor) for name, part in psf.components.items()},
         provenance={**psf.provenance, "binning": factor},
+        place=None if psf.place is None else psf.place.binned(factor),
     )
 
 

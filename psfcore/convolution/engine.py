@@ -26,7 +26,7 @@ import queue
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,6 +76,39 @@ class Lines(NamedTuple):
     plan: Plan
 
 
+class FieldLines(NamedTuple):
+    """Lines of all spectra that a PSF that changes over the field needs (`psfcore.convolution.field_engine`). The first
+    fields are those of `Lines`.
+
+    Attributes
+    ----------
+    second
+        A second buffer of the thread.
+    spectra
+        The spectra of the field times each u^a: [n] and then as the spectrum.
+    factors
+        The functions u^a [n][x].
+    from_rows
+        The number of spectra, beside the first, into which rows are transformed.
+    to_rows
+        The number of spectra that, each times its function, are added to rows that are transformed back.
+    """
+
+    spectrum: Single
+    buffer: Single
+    corner: Single
+    plan: Plan
+    second: Single
+    spectra: Single
+    factors: Single
+    from_rows: int
+    to_rows: int
+
+
+# The number of fields of `Lines`. The compiler leaves out what is for `FieldLines` alone.
+_FIELDS: Final = 4
+
+
 class Engine:
     """Convolution with one PSF, cut to one field, and the adjoint of this operator, in float32.
 
@@ -97,6 +130,8 @@ class Engine:
     threads
         Number of threads; it does not change the result.
     """
+
+    _buffers = 1  # of a thread
 
     def __init__(
         self,
@@ -132,7 +167,7 @@ class Engine:
         self._pool = ThreadPoolExecutor(max(threads - 1, 1))
         self._scratch: queue.SimpleQueue[Scratch] = queue.SimpleQueue()
         for _ in range(threads):
-            buffer = aligned(max(self.row_plan.length, self.column_plan.length) * 2 * LANES)
+            buffer = aligned(self._buffers * max(self.row_plan.length, self.column_plan.length) * 2 * LANES)
             self._scratch.put(Scratch(buffer, aligned(LANES, 4, LANES)))
 
     def twin(self) -> Engine:
@@ -147,7 +182,11 @@ class Engine:
     @cached_property
     def _spectrum(self) -> Single:
         """The spectrum of the field, in blocks of columns. It must be asked for before threads share it."""
-        return aligned(self.column_blocks, self.row_blocks * BLOCK_ROWS, 2, LANES)
+        return aligned(*self._shape_of_spectrum)
+
+    @property
+    def _shape_of_spectrum(self) -> tuple[int, ...]:
+        return self.column_blocks, self.row_blocks * BLOCK_ROWS, 2, LANES
 
     @cached_property
     def _whole(self) -> Single:
@@ -162,13 +201,21 @@ class Engine:
     @property
     def nbytes(self) -> int:
         """Memory that the engine holds between two deconvolutions, in bytes."""
-        scratch = self.threads * max(self.row_plan.length, self.column_plan.length) * 2 * LANES * 4
+        scratch = (
+            self.threads * self._buffers * max(self.row_plan.length, self.column_plan.length) * 2 * LANES * 4
+        )
         return self.transfer.nbytes + scratch
 
     @property
     def symmetric(self) -> bool:
         """Whether the PSF is symmetric about its centre. The transfer function is then real."""
         return bool(self.transfer.shape[2] == 1)
+
+    def local_transfers(self, rows: int) -> Iterator[Single]:
+        """The first rows of the transfer function, [block of columns][row][re, im][lane]. If the PSF changes over the
+        field: of those at nine places.
+        """
+        yield self.transfer[:, :rows]
 
     # Whole operators -------------------------------------------------------------------------------
 
@@ -236,11 +283,11 @@ class Engine:
 
     def rows_forward(self, lanes: Single, first_block: int = 0) -> None:
         """Transform the rows of a field, or of the blocks of a field from `first_block` on, into the spectrum."""
-        self._stage(_rows_forward, self.row_plan, len(lanes), lanes, first_block)
+        self.row_stage(_rows_forward, lanes, first_block, blocks=len(lanes))
 
     def rows_inverse(self, lanes: Single, first_block: int = 0) -> None:
         """Transform the spectrum's rows back into a field, or into its blocks from `first_block` on."""
-        self._stage(_rows_inverse, self.row_plan, len(lanes), lanes, first_block)
+        self.row_stage(_rows_inverse, lanes, first_block, blocks=len(lanes))
 
     def rows_cut(self) -> None:
         """As ``rows_inverse`` and ``rows_forward``, without a field in memory: cut what the spectrum contains to the
@@ -281,12 +328,26 @@ class Engine:
         """
         self._stage(_columns_inverse, self.column_plan, self.column_blocks, self._whole, transfer)
 
-    def row_stage(self, kernel: Callable[..., None], *fields: object) -> None:
+    def row_stage(
+        self,
+        kernel: Callable[..., None],
+        *fields: object,
+        before_h: bool = True,
+        blocks: int | None = None,
+    ) -> None:
         """Run the compiled row function of a method on all blocks: `kernel(lines, start, stop, *fields)`.
 
         lines: the rows, with the working memory of the thread. start, stop: the range of blocks.
+
+        Parameters
+        ----------
+        before_h
+            Whether H may be applied next to the rows that the function transforms. If H^T or a filter follows, an
+            engine for a PSF that changes over the field does less work.
+        blocks
+            The number of blocks; None: all.
         """
-        self._stage(kernel, self.row_plan, self.row_blocks, *fields)
+        self._stage(kernel, self.row_plan, self.row_blocks if blocks is None else blocks, *fields)
 
     def _stage(self, kernel: Callable[..., None], plan: Plan, blocks: int, *fields: object) -> None:
         spectrum = self._spectrum
@@ -408,15 +469,28 @@ def _wrapped_rows(
 
 
 @compiled()
-def rows_to_spectrum(lines: Lines, block: int, nx: int) -> None:
-    """Transform the block of rows that the buffer holds, `nx` px long, and separate it into the spectra of its 32 rows.
+def rows_to_spectrum(lines: Lines | FieldLines, block: int, nx: int) -> None:
+    """Transform the block of rows that the buffer holds, `nx` px long, and separate it into the spectra of its 32 rows:
+    the rows times each function of x first, because the buffer is transformed in place.
+    """
+    if len(lines) > _FIELDS:
+        for n in range(lines.from_rows):
+            weigh(lines.buffer, lines.factors[n], lines.second, nx)
+            _buffer_to_spectrum(lines, lines.second, lines.spectra[n], block, nx)
+    _buffer_to_spectrum(lines, lines.buffer, lines.spectrum, block, nx)
+
+
+@compiled()
+def _buffer_to_spectrum(
+    lines: Lines | FieldLines, buffer: Single, spectrum: Single, block: int, nx: int
+) -> None:
+    """Transform a block of rows in place, and separate it into the spectra of its 32 rows.
 
     Each complex signal of the block contains two real rows. If Z is the transform of a + i b with real a and b, then
     A[k] = (Z[k] + Z*[L-k]) / 2, B[k] = (Z[k] - Z*[L-k]) / (2 i).
     """
-    spectrum, buffer, corner = lines.spectrum, lines.buffer, lines.corner
-    length, place = lines.plan.length, lines.plan.place
-    _clear(buffer, nx * _SIZE, length)
+    corner, length, place = lines.corner, lines.plan.length, lines.plan.place
+    clear_beyond(buffer, nx * _SIZE, length)
     forward(buffer, lines.plan)
     last = length // 2
     rows = spectrum.shape[1]
@@ -435,14 +509,26 @@ def rows_to_spectrum(lines: Lines, block: int, nx: int) -> None:
 
 
 @compiled()
-def rows_from_spectrum(lines: Lines, block: int) -> Single:
-    """Transform a block of 32 rows back into the buffer, and return the buffer as [x, half, lane].
+def rows_from_spectrum(lines: Lines | FieldLines, block: int) -> Single:
+    """Transform a block of 32 rows back into the buffer, and return the buffer as [x, half, lane]. The blocks of the
+    spectra that are multiplied by functions of x are added.
+    """
+    _spectrum_to_buffer(lines, lines.spectrum, lines.buffer, block)
+    if len(lines) > _FIELDS:
+        for n in range(lines.to_rows):
+            _spectrum_to_buffer(lines, lines.spectra[n], lines.second, block)
+            add_weighed(lines.second, lines.factors[n], lines.buffer, lines.factors.shape[1])
+    return lines.buffer.reshape((-1, 2, LANES))
+
+
+@compiled()
+def _spectrum_to_buffer(lines: Lines | FieldLines, spectrum: Single, buffer: Single, block: int) -> None:
+    """Transform a block of 32 rows back.
 
     The spectra of the rows are joined first: Z[k] = A[k] + i B[k] and Z[L-k] = A*[k] + i B*[k], the inverse of
-    ``rows_to_spectrum``.
+    ``_buffer_to_spectrum``.
     """
-    spectrum, buffer, corner = lines.spectrum, lines.buffer, lines.corner
-    length, place = lines.plan.length, lines.plan.place
+    corner, length, place = lines.corner, lines.plan.length, lines.plan.place
     last = length // 2
     rows = spectrum.shape[1]
     for group in range(spectrum.shape[0]):
@@ -454,20 +540,38 @@ def rows_from_spectrum(lines: Lines, block: int) -> Single:
             at = (k - group * LANES) * 2 * _SIZE
             instructions.join(corner, buffer, at, place[k] * _SIZE, place[(length - k) % length] * _SIZE)
     inverse(buffer, lines.plan)
-    return buffer.reshape((-1, 2, LANES))
+
+
+@compiled()
+def weigh(values: Single, factors: Single, target: Single, count: int) -> None:
+    """Set target to the values times a factor for each line of 32 values, in `count` lines."""
+    for line in range(count):
+        factor = factors[line]
+        for n in range(line * _SIZE, (line + 1) * _SIZE):
+            target[n] = factor * values[n]
+
+
+@compiled()
+def add_weighed(values: Single, factors: Single, target: Single, count: int) -> None:
+    """Add to target the values times a factor for each line of 32 values, in `count` lines."""
+    for line in range(count):
+        factor = factors[line]
+        for n in range(line * _SIZE, (line + 1) * _SIZE):
+            target[n] += factor * values[n]
 
 
 # An assignment between slices of arrays would compile five seconds longer, because of its check of the shapes.
 
 
 @compiled()
-def _copy(values: Single, target: Single, count: int) -> None:
+def copy_numbers(values: Single, target: Single, count: int) -> None:
+    """Copy the first `count` numbers."""
     for n in range(count):
         target[n] = values[n]
 
 
 @compiled()
-def _clear(buffer: Single, filled: int, length: int) -> None:
+def clear_beyond(buffer: Single, filled: int, length: int) -> None:
     """Set the buffer of a transform to 0 beyond its first `filled` numbers."""
     buffer[filled : length * _SIZE] = np.float32(0.0)
 
@@ -483,7 +587,7 @@ def _rows_forward(lines: Lines, start: int, stop: int, lanes: Single, first_bloc
     """
     nx = lanes.shape[1]
     for block in range(start, stop):
-        _copy(lanes[block].reshape(-1), lines.buffer, nx * _SIZE)
+        copy_numbers(lanes[block].reshape(-1), lines.buffer, nx * _SIZE)
         rows_to_spectrum(lines, first_block + block, nx)
 
 
@@ -491,18 +595,18 @@ def _rows_forward(lines: Lines, start: int, stop: int, lanes: Single, first_bloc
 def _rows_inverse(lines: Lines, start: int, stop: int, lanes: Single, first_block: int) -> None:
     for block in range(start, stop):
         rows_from_spectrum(lines, first_block + block)
-        _copy(lines.buffer, lanes[block].reshape(-1), lanes.shape[1] * _SIZE)
+        copy_numbers(lines.buffer, lanes[block].reshape(-1), lanes.shape[1] * _SIZE)
 
 
 @compiled()
 def _rows_cut(lines: Lines, start: int, stop: int, nx: int, ny: int) -> None:
     for block in range(start, stop):
-        clear_beyond(rows_from_spectrum(lines, block), ny - block * BLOCK_ROWS, nx)
+        clear_rows_beyond(rows_from_spectrum(lines, block), ny - block * BLOCK_ROWS, nx)
         rows_to_spectrum(lines, block, nx)
 
 
 @compiled()
-def clear_beyond(z: Single, rows: int, nx: int) -> None:
+def clear_rows_beyond(z: Single, rows: int, nx: int) -> None:
     """Set the rows of a block [x, half, lane] beyond the number of rows to 0."""
     for row in range(max(rows, 0), BLOCK_ROWS):
         for i in range(nx):
@@ -529,12 +633,12 @@ def _columns(lines: Lines, start: int, stop: int, transfer: Single, conjugate: b
     filled = min(lines.spectrum.shape[1], length) * _SIZE
     for group in range(start, stop):
         column = lines.spectrum[group].reshape(-1)
-        _copy(column, buffer, filled)
-        _clear(buffer, filled, length)
+        copy_numbers(column, buffer, filled)
+        clear_beyond(buffer, filled, length)
         forward(buffer, lines.plan)
         _multiply(buffer, transfer, group, length, conjugate)
         inverse(buffer, lines.plan)
-        _copy(buffer, column, filled)
+        copy_numbers(buffer, column, filled)
 
 
 @compiled()
@@ -543,8 +647,8 @@ def _columns_forward(lines: Lines, start: int, stop: int, whole: Single) -> None
     filled = min(lines.spectrum.shape[1], lines.plan.length) * _SIZE
     for group in range(start, stop):
         column = whole[group].reshape(-1)
-        _copy(lines.spectrum[group].reshape(-1), column, filled)
-        _clear(column, filled, lines.plan.length)
+        copy_numbers(lines.spectrum[group].reshape(-1), column, filled)
+        clear_beyond(column, filled, lines.plan.length)
         forward(column, lines.plan)
 
 
@@ -554,7 +658,7 @@ def _columns_inverse(lines: Lines, start: int, stop: int, whole: Single, transfe
     buffer, length = lines.buffer, lines.plan.length
     filled = min(lines.spectrum.shape[1], length) * _SIZE
     for group in range(start, stop):
-        _copy(whole[group].reshape(-1), buffer, length * _SIZE)
+        copy_numbers(whole[group].reshape(-1), buffer, length * _SIZE)
         _multiply(buffer, transfer, group, length, False)
         inverse(buffer, lines.plan)
-        _copy(buffer, lines.spectrum[group].reshape(-1), filled)
+        copy_numbers(buffer, lines.spectrum[group].reshape(-1), filled)

@@ -194,6 +194,22 @@ def turn_back(_: object, z: types.Type, factors: types.Type, at: types.Type, of:
     return written(partial(_write_turn, conjugate=True), (z, factors), 2)
 
 
+@instruction
+def add_scaled(
+    _: object, z: types.Type, factors: types.Type, total: types.Type, at: types.Type, of: types.Type
+) -> Written:
+    """Add to the complex numbers at total[at] those at z[at] times the real factors at factors[of]."""
+    return written(_write_add_scaled, (z, factors, total), 2)
+
+
+@instruction
+def add_turned(
+    _: object, z: types.Type, factors: types.Type, total: types.Type, at: types.Type, of: types.Type
+) -> Written:
+    """Add to the complex numbers at total[at] those at z[at] times the complex factors at factors[of]."""
+    return written(_write_add_turned, (z, factors, total), 2)
+
+
 def _write_transpose(
     source: Memory, target: Memory, first: ir.Value, step: ir.Value, to: ir.Value, to_step: ir.Value
 ) -> None:
@@ -257,3 +273,18 @@ def _write_turn(z: Memory, factors: Memory, at: ir.Value, of: ir.Value, *, conju
         ti = -ti if conjugate else ti
         z.store(r * tr - i * ti, at, lane)
         z.store(r * ti + i * tr, at, lane + LANES)
+
+
+def _write_add_scaled(z: Memory, factors: Memory, total: Memory, at: ir.Value, of: ir.Value) -> None:
+    for lane in parts():
+        factor = factors.load(of, lane)
+        for place in (lane, lane + LANES):
+            total.store(z.load(at, place).times_plus(factor, total.load(at, place)), at, place)
+
+
+def _write_add_turned(z: Memory, factors: Memory, total: Memory, at: ir.Value, of: ir.Value) -> None:
+    for lane in parts():
+        r, i = z.load(at, lane), z.load(at, lane + LANES)
+        tr, ti = factors.load(of, lane), factors.load(of, lane + LANES)
+        total.store(r * tr - i * ti + total.load(at, lane), at, lane)
+        total.store(r * ti + i * tr + total.load(at, lane + LANES), at, lane + LANES)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.convolution.engine import Engine
+from psfcore.convolution.field_engine import FieldEngine
 from psfcore.deconvolve.box import Box
 from psfcore.deconvolve.declaration import Edges
 from psfcore.errors import DataError
@@ -22,14 +23,19 @@ from psfcore.psf_sampling import AS_BUILT, sampling_of
 
 Progress = Callable[[int, int], None]
 Shape = tuple[int, int]
-# (psf, shape of the plane, span within which the convolution is exact, threads)
-EngineFor = Callable[[Psf, Shape, Shape, int], Engine]
+# (psf, shape of the plane, span within which the convolution is exact, threads, width of the margin around the image)
+EngineFor = Callable[[Psf, Shape, Shape, int, int], Engine]
 Thing = TypeVar("Thing", Psf, tuple[Psf, Engine])
 
 
-def new_engine(psf: Psf, shape: Shape, span: Shape, threads: int) -> Engine:
-    """Make a new engine."""
-    return Engine(psf.kernel, shape, span=span, threads=threads)
+def new_engine(psf: Psf, shape: Shape, span: Shape, threads: int, margin_px: int = 0) -> Engine:
+    """Make a new engine, for a plane that consists of an image and a margin around it."""
+    terms = [term for term in psf.field_terms if term.kernel.any()]
+    if not terms:
+        return Engine(psf.kernel, shape, span=span, threads=threads)
+    assert psf.place is not None
+    coordinates = psf.place.from_pixel(-margin_px, -margin_px).coordinates(shape)
+    return FieldEngine(psf.kernel, terms, coordinates, shape, span=span, threads=threads)
 
 
 @dataclass(frozen=True)
@@ -180,24 +186,32 @@ class PreparedPsfs:
         """The PSF that `read` returns; repeated calls with the same key return the same object."""
         return self._once(key, read, _kernel_bytes)
 
-    def on_pixels_of(self, header: Cards, key: Hashable, read: Callable[[], Psf]) -> Psf:
-        """The PSF of `as_built` on the pixels of an image with this header; repeated calls return the same object."""
+    def on_pixels_of(
+        self, header: Cards, key: Hashable, read: Callable[[], Psf], shape: Shape | None = None
+    ) -> Psf:
+        """The PSF of `as_built` on the pixels of an image with this header; repeated calls return the same object.
+
+        Parameters
+        ----------
+        shape
+            Shape (ny, nx) of the image; None: as the header says.
+        """
         whole = self.as_built(key, read)
-        sampling = sampling_of(whole, header)
+        sampling = sampling_of(whole, header, shape)
         if sampling == AS_BUILT:
             return whole
         return self._once((key, sampling), lambda: sampling.of(whole), _kernel_bytes)
 
-    def engine_for(self, psf: Psf, shape: Shape, span: Shape, threads: int) -> Engine:
+    def engine_for(self, psf: Psf, shape: Shape, span: Shape, threads: int, margin_px: int = 0) -> Engine:
         """The engine for a PSF and a shape. Pass the same PSF object again: the cache compares identity, not
         content.
         """
 
         def make() -> tuple[Psf, Engine]:
-            return psf, new_engine(psf, shape, span, threads)
+            return psf, new_engine(psf, shape, span, threads, margin_px)
 
         # The PSF is kept together with its engine, so that Python cannot give the id() of the PSF to another object.
-        return self._once((id(psf), shape, span, threads), make, lambda pair: pair[1].nbytes)[1]
+        return self._once((id(psf), shape, span, threads, margin_px), make, lambda pair: pair[1].nbytes)[1]
 
     def _once(self, key: Hashable, make: Callable[[], Thing], size: Callable[[Thing], int]) -> Thing:
         if key not in self._kept:
@@ -210,4 +224,4 @@ class PreparedPsfs:
 
 
 def _kernel_bytes(psf: Psf) -> int:
-    return int(psf.kernel.nbytes)
+    return int(psf.kernel.nbytes) + sum(term.kernel.nbytes for term in psf.field_terms)

@@ -43,6 +43,7 @@ from psfcore.deconvolve.declaration import WITHOUT_MARGIN, Edges
 from psfcore.errors import DataError
 from psfcore.image import Image
 from psfcore.psf import Psf
+from psfcore.psf_field import common_shape, nine_places
 
 EDGES: tuple[Edges, ...] = get_args(Edges)
 
@@ -133,12 +134,23 @@ class Domain:
 
 
 def share_from_beyond(psf: Psf) -> NDArray[np.float64]:
-    """Compute b of Eq. (1) for d = 0, 1, ... px, up to half the size of the PSF."""
-    ny, nx = psf.kernel.shape
+    """Compute b of Eq. (1) for d = 0, 1, ... px, up to half the size of the PSF. If the PSF changes over the field, it
+    is the largest b of nine places.
+    """
+    kernels = common_shape(psf.kernel, psf.field_terms)
+    along_y, along_x = (np.array([one.sum(axis=axis) for one in kernels]) for axis in (1, 0))
+    places = nine_places() if psf.field_terms else [(0.0, 0.0)]
+    factors = [np.array([1.0, *(term.at(u, v) for term in psf.field_terms)]) for u, v in places]
+    return np.asarray(np.max([_share(of @ along_y, of @ along_x) for of in factors], axis=0))
+
+
+def _share(along_y: NDArray[np.float64], along_x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """B of Eq. (1) from the sums of a PSF's rows and of its columns."""
+    ny, nx = along_y.size, along_x.size
     shares = np.zeros((4, max(ny, nx) + 1))
     for n, (line, centre) in enumerate(
         (line, centre)
-        for total, size in ((psf.kernel.sum(axis=1), ny), (psf.kernel.sum(axis=0), nx))
+        for total, size in ((along_y, ny), (along_x, nx))
         for line, centre in ((total, size // 2), (total[::-1], size - 1 - size // 2))
     ):
         beyond = line[centre + 1 :]

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore import software_version
-from psfcore.convolution.engine import Engine
-from psfcore.deconvolve.conditions import Progress
+from psfcore.deconvolve.conditions import Progress, new_engine
 from psfcore.deconvolve.declaration import KnownScene
 from psfcore.deconvolve.doubts import input_warnings
 from psfcore.deconvolve.edges import lay_out, margin_for, share_from_beyond
@@ -136,7 +135,7 @@ def convolve(image: Image, psf: Psf, *, edges: KnownScene = "zero", threads: int
     ny, nx = image.pixels.shape
     margin_px = margin_for(share_from_beyond(psf), (ny, nx), share=0.0)
     domain = lay_out(image, edges=edges, margin_px=margin_px)
-    engine = Engine(psf.kernel, domain.shape, span=domain.shape, threads=threads)
+    engine = new_engine(psf, domain.shape, domain.shape, threads, domain.margin_px)
     pixels = domain.cut([(0, engine.apply(domain.pixels))])
     pixels[~image.finite] = np.nan
     return pixels.astype(np.float64)
@@ -167,8 +166,9 @@ def convolve_image(
         (ny, nx), (rows, columns) = image.pixels.shape, source.kernel_shape
         needed = convolution_bytes((ny, nx), (rows, columns), edges)
         check_memory((ny, nx), needed, free_bytes, task="convolution", advice="use a smaller model image")
+    ny, nx = image.pixels.shape
     _, fitted, channel = source.on_pixels_of(
-        image.header, lambda: source.load(image.header, begin(BUILDING, 1))
+        image.header, (ny, nx), lambda: source.load(image.header, begin(BUILDING, 1))
     )
     warnings = {**source.warnings, **input_warnings(source.seen_as(fitted), image, None, channel=channel)}
     pixels = convolve(image, fitted, edges=edges, threads=threads)

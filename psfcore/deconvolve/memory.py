@@ -2,7 +2,7 @@
 
 It follows from the sizes of image and PSF:
 
-    bytes = plane_bytes P + transform_bytes L + image_bytes I + psf_bytes K        Eq. (1)
+    bytes = plane_bytes P + (transform_bytes + term_bytes M) L + image_bytes I + psf_bytes (1 + M) K        Eq. (1)
 
 `python -m benchmarks.growth memory` measures both sides of Eq. (1). The size of the margin follows from the PSF, which
 may not exist yet; the figure margin_of_psf of each method was measured with the PSF of HRI_EUV, which scatters much
@@ -14,6 +14,7 @@ light. This module imports no numerical libraries, because the web process uses 
 | P | pixels of the plane: image and margins | px |
 | L | pixels of the transforms: the plane, padded for the reach of the PSF | px |
 | K | pixels of the PSF | px |
+| M | terms of a PSF that changes over the field | - |
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ Shape = tuple[int, int]
 IMAGE_BYTES = 20.0  # the image in float64, the result and the compared planes in float32, and the masks
 ERRORS_BYTES = 240.0  # further bytes for each pixel of the image, if errors are estimated
 PSF_BYTES = 8.0
+TERM_BYTES = 10.0  # a transfer function (complex), and a further spectrum of the plane
 ASSESSED_BYTES = (
     12.0  # for each pixel of an image: to measure the changes, and to draw the pictures of a product
 )
@@ -51,6 +53,8 @@ class Demand:
         Edges and width of the margin; None: the default of the method.
     draws
         Number of noise realisations.
+    terms
+        Number of the terms of a PSF that changes over the field.
     """
 
     method: str
@@ -59,6 +63,7 @@ class Demand:
     edges: str | None = None
     margin_px: int | None = None
     draws: int = 0
+    terms: int = 0
 
     @property
     def margin(self) -> int:
@@ -96,9 +101,9 @@ def deconvolution_bytes(demand: Demand) -> float:
     plane_bytes, transform_bytes = (_figure(demand.method, one) for one in ("plane_bytes", "transform_bytes"))
     return (
         plane_bytes * math.prod(demand.plane)
-        + transform_bytes * math.prod(demand.transform)
+        + (transform_bytes + TERM_BYTES * demand.terms) * math.prod(demand.transform)
         + image_bytes * math.prod(demand.image)
-        + PSF_BYTES * math.prod(demand.psf)
+        + PSF_BYTES * (1 + demand.terms) * math.prod(demand.psf)
     )
 
 

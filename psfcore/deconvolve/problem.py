@@ -210,7 +210,7 @@ def pose(method: Method, image: Image, psf: Psf, conditions: Conditions, *, step
         shape = (image.pixels.shape[0], image.pixels.shape[1])
         margin_px = margin_for(shares, shape, share=method.margin_share)
     domain = lay_out(image, edges=conditions.edges or method.edges, margin_px=margin_px)
-    engine = conditions.engine_for(psf, domain.shape, domain.span, conditions.threads)
+    engine = conditions.engine_for(psf, domain.shape, domain.span, conditions.threads, domain.margin_px)
     judged = _judgement(image, band, domain, engine, conditions)
     return Problem(method, image, psf, conditions, domain, engine, judged, band, steps, stop)
 

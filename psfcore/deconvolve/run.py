@@ -277,6 +277,8 @@ class PsfSource:
         compared with the image before it is built.
     kernel_shape
         Shape (ny, nx) of the kernel.
+    field_terms
+        Number of the terms of a PSF that changes over the field.
     plate_scale_arcsec
         Plate scale of a PSF whose file gives none.
     prepared
@@ -298,6 +300,7 @@ class PsfSource:
     key: Hashable = None
     built: PsfOrigin | None = None
     kernel_shape: tuple[int, ...] = (REACH_GRID_PX, REACH_GRID_PX)
+    field_terms: int = 0
     plate_scale_arcsec: float | None = None
     prepared: PreparedPsfs = field(default_factory=PreparedPsfs)
     other_channel: bool = False
@@ -306,12 +309,16 @@ class PsfSource:
     provenance: Mapping[str, object] | None = None
     warnings: Mapping[str, str] = field(default_factory=dict)
 
-    def on_pixels_of(self, header: Header, load: Callable[[], Psf]) -> tuple[Psf, Psf, str | None]:
+    def on_pixels_of(
+        self, header: Header, shape: tuple[int, int], load: Callable[[], Psf]
+    ) -> tuple[Psf, Psf, str | None]:
         """The PSF as it is read or built, the PSF on the pixels of an image with this header, and the answer of
         `check_channel`.
 
         Parameters
         ----------
+        shape
+            Shape (ny, nx) of the image.
         load
             Function that calls `load` of this source.
         """
@@ -327,7 +334,7 @@ class PsfSource:
         if self.built is not None:
             binning_factor(with_scale(self.built, self.plate_scale_arcsec), header)
         whole = self.prepared.as_built(key, as_built)
-        return whole, self.prepared.on_pixels_of(header, key, as_built), channel
+        return whole, self.prepared.on_pixels_of(header, key, as_built, shape), channel
 
 
 def read_and_deconvolve(
@@ -376,6 +383,7 @@ def read_and_deconvolve(
             edges=options.edges,
             margin_px=options.margin_px,
             draws=options.error_draws,
+            terms=source.field_terms,
         )
         check_memory(plane, product_bytes(demand, shape[0] * shape[1]), free_bytes)
 
@@ -391,7 +399,8 @@ def read_and_deconvolve(
     header = image.header
     if not again:
         check_exposure_of_sun(header)
-    whole, fitted, channel = source.on_pixels_of(header, load)
+    ny, nx = image.pixels.shape
+    whole, fitted, channel = source.on_pixels_of(header, (ny, nx), load)
     warnings = {
         **source.warnings,
         **input_warnings(source.seen_as(fitted), image, options.method, channel=channel, edges=options.edges),

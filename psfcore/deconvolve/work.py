@@ -48,7 +48,7 @@ from numpy.typing import NDArray
 
 from psfcore.deconvolve.assess.changes import Changes, QualityBit, measure_changes, quality_plane
 from psfcore.deconvolve.box import LARGEST_ERROR, Box, region_without_discrepancy, region_without_errors
-from psfcore.deconvolve.conditions import Conditions, Deconvolved, OfBox, Progress, fluxes
+from psfcore.deconvolve.conditions import Conditions, Deconvolved, OfBox, Progress, fluxes, new_engine
 from psfcore.deconvolve.declaration import WITHOUT_MARGIN, Edges
 from psfcore.deconvolve.edges import margin_for, share_from_beyond
 from psfcore.deconvolve.methods.registry import method_named, properties_of
@@ -56,11 +56,12 @@ from psfcore.errors import DataError
 from psfcore.fits.viewing.regions import moved_header
 from psfcore.image import Image
 from psfcore.noise import Noise
-from psfcore.psf import Psf
+from psfcore.psf import Psf, psf_from_pixel, with_kernels
 from psfcore.psf_sampling import check_compatible, rebinned_kernel
 
 if TYPE_CHECKING:
     from psfcore.convolution.convolver import Convolver
+    from psfcore.convolution.engine import Engine
     from psfcore.deconvolve.assess.error_planes import ErrorPlanes
 
 ERROR_ESTIMATE = "error estimate"  # a stage whose steps are noise realisations
@@ -364,6 +365,7 @@ def box_work(work: Work, box: Box) -> BoxWork:
         alone = replace(
             work,
             image=_part(image, rim, pixels),
+            psf=psf_from_pixel(work.psf, rim.x0, rim.y0),
             options=replace(options, edges="zero", margin_px=None, noise=None),
         )
         error = light.error
@@ -418,11 +420,12 @@ class _FarLight:
         self._brightest = float(np.abs(image.pixels).max(where=image.finite, initial=0))
         self._threads, self._keeps_flux = work.options.threads, keeps_flux
         self._kernel = rebinned_kernel(kernel, self.factor)
+        self._field = work.psf if work.psf.field_terms else None
         coarse = _means(image, self.factor)
         margin = margin_px // self.factor
         plane = np.pad(coarse, margin, mode="symmetric")
         field = tuple(slice(margin, margin + n) for n in coarse.shape)
-        convolver = self._convolver(plane.shape)
+        convolver = self._convolver(plane.shape, (-margin, -margin))
         kept = 1 / _compensation(convolver, plane.shape) if self._keeps_flux else np.ones(plane.shape)
         scene = plane
         for _ in range(_ITERATIONS):
@@ -430,7 +433,12 @@ class _FarLight:
         self._kept = kept[field]
         self._scene, self._light = scene[field], convolver.apply(scene)[field]
 
-    def _convolver(self, shape: tuple[int, int]) -> Convolver:
+    def _convolver(self, shape: tuple[int, int], first: tuple[int, int]) -> Convolver | Engine:
+        """The operator of a plane of coarse pixels whose first one is the pixel `first` (x, y) of the coarse image."""
+        if self._field is not None:
+            coarse = with_kernels(self._field, lambda kernel: rebinned_kernel(kernel, self.factor))
+            place = coarse.place.binned(self.factor).from_pixel(*first) if coarse.place else None
+            return new_engine(replace(coarse, place=place), shape, shape, self._threads)
         # A deconvolution of a whole image does not load SciPy.
         from psfcore.convolution.convolver import Convolver
 
@@ -440,7 +448,7 @@ class _FarLight:
         """The light from beyond a rim."""
         k = self.factor
         here = slice(rim.y0 // k, -(-rim.y1 // k)), slice(rim.x0 // k, -(-rim.x1 // k))
-        convolver = self._convolver(self._scene[here].shape)
+        convolver = self._convolver(self._scene[here].shape, (here[1].start, here[0].start))
         light = np.maximum(self._light[here] - convolver.apply(self._scene[here]), 0)  # Eq. (1)
         kept, shares = self._kept[here], np.ones(light.shape)
         if self._keeps_flux:
@@ -451,7 +459,7 @@ class _FarLight:
         return _Light(fine, kept, shares, error)
 
 
-def _compensation(convolver: Convolver, shape: tuple[int, int]) -> Plane:
+def _compensation(convolver: Convolver | Engine, shape: tuple[int, int]) -> Plane:
     """R of H^T r = 1, by the iteration of van Cittert."""
     ones = np.ones(shape)
     ratio = ones

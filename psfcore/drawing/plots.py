@@ -25,6 +25,7 @@ from matplotlib.text import Text
 from matplotlib.ticker import FixedFormatter, FuncFormatter, MaxNLocator
 from numpy.typing import NDArray
 
+from psfcore.drawing.field_plot import field_figure
 from psfcore.drawing.thumbnail import EUV_POINTS, NO_DATA, block_means
 from psfcore.instruments.psf_statements import curves_once, title
 from psfcore.psf import REACH_GRID_PX, Kernel, Psf, crop_centred, cumulative_curve, radial_profile
@@ -216,7 +217,10 @@ def psf_figure(psf: Psf) -> Figure:
     """Draw three panels: the centre on a logarithmic scale, mean weight by radius, 1 - encircled energy by radius.
 
     There is a curve for the total PSF and one for each component. The Airy pattern of the open aperture is a reference.
+    Of a PSF that changes over the field: `field_figure`.
     """
+    if psf.field_terms:
+        return field_figure(psf)
     figure = Figure(
         figsize=(15.6, 5.6),
         dpi=100,

@@ -46,6 +46,7 @@ from numpy.typing import NDArray
 
 from psfcore.arrays import Flags, Kernel, Plane, Vector
 from psfcore.errors import DataError
+from psfcore.psf import Psf
 from psfcore.scatter.reconstruction import LEAST_DARK_PIXELS, Progress, dark_pixels
 from psfcore.scatter.total_psf import Optics, Pixels, noise_covariance, pick, put
 from psfcore.transit.occulter import DOUBT_SIGMAS, FoundPlace, find_occulter
@@ -291,7 +292,7 @@ class Evaluation:
 
 def evaluate(
     transit: Transit,
-    psf_for_frame: Callable[[int], Kernel],
+    psf_for_frame: Callable[[int], Kernel | Psf],
     *,
     noise_realisations: int = NOISE_REALISATIONS,
     seed: int = 1,
@@ -308,8 +309,9 @@ def evaluate(
     Parameters
     ----------
     psf_for_frame
-        Function that returns the total PSF [y, x] for the index of an image, centre at [n // 2, n // 2]. A PSF is
-        prepared only once for all images for which this function returns the same array object.
+        Function that returns the total PSF [y, x] for the index of an image, centre at [n // 2, n // 2], or a PSF that
+        may change over the field, on the pixels of the images. A PSF is prepared only once for all images for which
+        this function returns the same object.
     noise_realisations
         Number of noise realisations for each image; they give the superposed maps of noise alone.
     seed
@@ -371,9 +373,9 @@ def _sliced(frames: Sequence[Frame]) -> set[int]:
 class _FrameSimulator:
     """Simulates the images of a transit with one PSF."""
 
-    def __init__(self, transit: Transit, kernel: Kernel, threads: int) -> None:
-        self.transit, self.kernel = transit, kernel
-        self.optics = optics = Optics(kernel, transit.shape, threads=threads)
+    def __init__(self, transit: Transit, psf: Kernel | Psf, threads: int) -> None:
+        self.transit, self.kernel = transit, psf.kernel if isinstance(psf, Psf) else psf
+        self.optics = optics = Optics(psf, transit.shape, threads=threads)
 
         # The function does not use `self`: a cycle of references would keep the scenes too long.
         def scene(n: int) -> NDArray[np.float32]:

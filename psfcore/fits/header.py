@@ -10,6 +10,7 @@ import math
 import os
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -17,7 +18,7 @@ from typing import TYPE_CHECKING
 
 from typing_extensions import TypedDict
 
-from psfcore.errors import DataError
+from psfcore.errors import DataError, HeaderError
 from psfcore.fits.blocks import FitsLimits, Hdu, first_image, open_source, skip_data, walk
 from psfcore.fits.cards import (
     Cards,
@@ -52,6 +53,7 @@ _OLD_DATE = re.compile(r"\A(\d\d)/(\d\d)/(\d\d)\Z")  # FITS before 1998: day, mo
 _LEAP_SECOND = re.compile(r"(.*T\d\d:\d\d):60(\.\d*)?(Z?)")
 # The content of a file, see `content_of`.
 IMAGE, PRODUCT, PSF, ELSEWHERE = "image", "product", "psf", "deconvolved elsewhere"
+FIELD = "FIELD"  # name of the extensions with the terms of a PSF that changes over the field
 _DECONVOLVED = re.compile(
     r"(?<!not )\bdeconvolved\b|_deconvol|richardson.?lucy|psf[ -]correct(ed|ion)", re.IGNORECASE
 )
@@ -177,6 +179,17 @@ def all_hdus(path: str | os.PathLike[str], limits: FitsLimits) -> list[Hdu]:
 def is_plane(hdu: Hdu) -> bool:
     """Whether an HDU is a plane of a product, see `psfcore.fits.images`."""
     return hdu.kind == "image" and lenient_value(hdu.header, "PLANE") is True
+
+
+def field_hdus(path: str | os.PathLike[str], limits: FitsLimits) -> list[Hdu]:
+    """The HDUs of the terms of a PSF that changes over the field: images named FIELD.
+
+    Damage behind the first image of a file is no error here, because it is none for a PSF without terms.
+    """
+    found: list[Hdu] = []
+    with suppress(HeaderError), open_source(Path(path), limits) as source:
+        found.extend(hdu for hdu in walk(source, limits) if hdu.kind == "image" and hdu.name == FIELD)
+    return found
 
 
 def content_of(header: Header) -> str:

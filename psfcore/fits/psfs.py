@@ -19,12 +19,13 @@ from numpy.typing import NDArray
 
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits, Hdu
-from psfcore.fits.cards import optional_number, optional_text
+from psfcore.fits.cards import card_count, optional_number, optional_text
 from psfcore.fits.frame import plate_scale_arcsec
 from psfcore.fits.hdus import as_written, ascii_text, read_pixels, readable_pixels, write_hdus
-from psfcore.fits.header import all_hdus, origin_of, wavelength_angstrom
+from psfcore.fits.header import FIELD, all_hdus, field_hdus, origin_of, wavelength_angstrom
 from psfcore.limited import run_limited, scratch_file
 from psfcore.psf import FittedShape, Psf, cumulative_curve, encircled_energy, radial_profile
+from psfcore.psf_field import MOST_TERMS, FieldTerm, Place
 
 # The cards of the publication of a PSF, by their names in the provenance.
 _PUBLICATION = {"doi": ("PSFDOI", "DOI of its publication"), "citation": ("PSFREF", "")}
@@ -32,7 +33,7 @@ _STATED = re.compile(r"psf_id: ([0-9a-f]{64})")
 
 
 def write_psf(path: str | Path, psf: Psf, *, instrument_file: bytes | None = None) -> None:
-    """Write a PSF: the kernel in the primary HDU, one image HDU per component, and tables.
+    """Write a PSF: the kernel in the primary HDU, one image HDU per component and per term of the field, and tables.
 
     The tables are PROFILE (weight by radius), FIT (the fitted shape, if any) and INSTRUMENT. Weights are stored as
     float32. The rounding changes each weight by at most 6e-8 of its value, and the sum by less than 1e-7.
@@ -49,6 +50,7 @@ def write_psf(path: str | Path, psf: Psf, *, instrument_file: bytes | None = Non
         component = fits.ImageHDU(kernel.astype(np.float32), name=ascii_text(name).upper())
         component.header["PSFSUM"] = (float(kernel.sum()), "sum of weights on this array")
         hdus.append(component)
+    hdus.extend(_field_hdus(psf))
     hdus.append(_profile_hdu(psf))
     if psf.fitted is not None:
         hdus.append(_fitted_hdu(psf.fitted))
@@ -63,7 +65,23 @@ def write_kernel(path: str | Path, psf: Psf) -> None:
     """Write the kernel of a PSF and its header, as `write_psf`, but no tables, which a large PSF would need much memory
     for.
     """
-    write_hdus(path, [fits.PrimaryHDU(psf.kernel.astype(np.float32), _psf_header(psf))])
+    write_hdus(path, [fits.PrimaryHDU(psf.kernel.astype(np.float32), _psf_header(psf)), *_field_hdus(psf)])
+
+
+def _field_hdus(psf: Psf) -> list[fits.ImageHDU]:
+    """One HDU for each term of the field. The place of the PSF must be that of a whole detector; if this detector is
+    binned, its outermost pixels have coordinates below 1 in size, for which the factor corrects.
+    """
+    hdus = []
+    for term in psf.field_terms:
+        assert psf.place is not None
+        (nx, ny), (u, v) = psf.place.detector, (-psf.place.x[0], -psf.place.y[0])
+        hdu = fits.ImageHDU((term.at(u, v) * term.kernel).astype(np.float32), name=FIELD)
+        for axis, power, size in (("X", term.x_power, nx), ("Y", term.y_power, ny)):
+            hdu.header[f"{axis}POWER"] = (power, f"power of the {axis.lower()} coordinate, -1 to 1")
+            hdu.header[f"FIELDN{axis}"] = (size, "[pixel] size of the detector")
+        hdus.append(hdu)
+    return hdus
 
 
 def _psf_header(psf: Psf) -> fits.Header:
@@ -76,6 +94,8 @@ def _psf_header(psf: Psf) -> fits.Header:
             ("REACH", psf.reach_px, "[pixel] farthest pixel from the centre"),
         ]
     )
+    if psf.field_terms:
+        header["NFIELD"] = (len(psf.field_terms), "extensions FIELD: it changes over the field")
     if psf.instrument is not None:
         header["INSTRUME"] = (ascii_text(psf.instrument), "instrument description")
     for key, text in psf.cards.items():
@@ -146,7 +166,8 @@ def read_psf(path: str | Path, limits: FitsLimits, *, parts: bool = True) -> Psf
     missing, the PSF is named after the file. The provenance has "doi" and "citation", if the file says how to cite the
     PSF.
 
-    Raises HeaderError; DataError "unreadable-pixels" and the errors of `Psf` ("psf-not-centred", "psf-sum", ...).
+    The terms of a PSF that changes over the field are always read. Raises HeaderError; DataError "unreadable-pixels",
+    "psf-field" and the errors of `Psf` ("psf-not-centred", "psf-sum", ...).
 
     Parameters
     ----------
@@ -159,6 +180,7 @@ def read_psf(path: str | Path, limits: FitsLimits, *, parts: bool = True) -> Psf
     components, provenance, fitted = (
         _read_extras(path, limits, kernel.shape) if parts and "PSFNAME" in header else ({}, {}, None)
     )
+    terms, place = _read_field(path, limits, stored.number, optional_number(header, "NFIELD"))
     instrument, cards = origin_of(header)
     publication = {
         key: text
@@ -178,7 +200,42 @@ def read_psf(path: str | Path, limits: FitsLimits, *, parts: bool = True) -> Psf
         fitted=fitted,
         cards=cards,
         turn_deg=optional_number(header, "PSFTURN") or 0.0,
+        field_terms=terms,
+        place=place,
     )
+
+
+def _read_field(
+    path: str | Path, limits: FitsLimits, image: int, stated: float | None
+) -> tuple[tuple[FieldTerm, ...], Place | None]:
+    """The terms of a PSF that changes over the field, and the place of the pixels of the detector.
+
+    Parameters
+    ----------
+    image
+        Number of the HDU of the kernel.
+    stated
+        The number of terms that the file states; None: it states none.
+    """
+    hdus = [hdu for hdu in field_hdus(path, limits) if hdu.number != image]
+    powers = [tuple(card_count(hdu.header, key) for key in ("XPOWER", "YPOWER")) for hdu in hdus]
+    sizes = {tuple(card_count(hdu.header, f"FIELDN{axis}") for axis in "XY") for hdu in hdus}
+    problem = (
+        f"expected the {stated:.0f} extensions FIELD that the card NFIELD states; got {len(hdus)}"
+        if stated is not None and stated != len(hdus)
+        else f"expected at most {MOST_TERMS} extensions FIELD, each with other powers; got {powers}"
+        if len(set(powers)) < len(powers) or len(powers) > MOST_TERMS
+        else f"expected one size of the detector (FIELDNX, FIELDNY) in all extensions FIELD; got {sorted(sizes)}"
+        if len(sizes) > 1
+        else None
+    )
+    if problem is not None:
+        raise DataError("psf-field", f"{problem}: copy or make the file again")
+    terms = tuple(
+        FieldTerm(read_pixels(path, limits, hdu=hdu.number).pixels, *power)
+        for hdu, power in zip(hdus, powers, strict=True)
+    )
+    return terms, Place.of_detector(*sizes.pop()) if sizes else None
 
 
 def stated_id(path: str | Path, limits: FitsLimits) -> str | None:
@@ -242,6 +299,7 @@ def write_extras(target: BinaryIO, *, path: str, count: int, shape: list[int]) -
             if (
                 isinstance(hdu, fits.ImageHDU)
                 and hdu.shape == tuple(shape)
+                and hdu.name != FIELD
                 and hdu.name not in extras["components"]
             ):
                 extras["components"].append(hdu.name)

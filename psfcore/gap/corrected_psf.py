@@ -7,7 +7,8 @@ of the image of a point source for one unit of theta_k. To first order, the corr
 
 Negative values of H' are set to zero, and H' is scaled to the sum of H. An effect of the detector or of the scene is
 not part of a PSF: it changes H only because the fit no longer mistakes its light for scatter. For an effect that varies
-across the field, dH_k is the change at the centre of the field.
+across the field, dH_k is the change at the centre of the field; the change of the scatter over the field becomes terms
+of the PSF (`field_terms`).
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import numpy as np
 from psfcore.arrays import Kernel
 from psfcore.errors import DataError
 from psfcore.gap.diagnose import Diagnosis
+from psfcore.gap.field_terms import with_terms
 from psfcore.gap.verdict.correction import Corrected
 from psfcore.gap.view import Field, View
 from psfcore.psf import REACH_GRID_PX, Psf
@@ -48,7 +50,6 @@ def corrected_psf(found: Diagnosis, name: str, version: str, provenance: dict[st
             "expected a diagnosis that names an effect and fitted it together with the PSF; got the verdict "
             f"{found.answer.verdict}: this diagnosis has no corrected PSF",
         )
-    inversion = added.solution.inversion
     history = {
         "effects": [effect.name for effect in added.effects],
         "effect_in_kernel": [effect.name for effect in added.effects if effect.stage == "optics"],
@@ -61,16 +62,26 @@ def corrected_psf(found: Diagnosis, name: str, version: str, provenance: dict[st
         "gap_after_pct": found.after.to_json(),
         "inputs_sha256": added.solution.transit.sha256,
     }
+    return psf_of_refit(added, name, version, provenance | history)
+
+
+def psf_of_refit(added: Corrected, name: str, version: str, provenance: dict[str, object]) -> Psf:
+    """The PSF of a full refit: Eq. (1), with the terms of a scatter that changes over the field.
+
+    Raises the errors of `corrected_psf`.
+    """
+    inversion = added.solution.inversion
     scatter = inversion.shape.kernel(inversion.coordinates, REACH_GRID_PX)
-    return psf_of_fit(
+    psf = psf_of_fit(
         _kernel(added),
         scatter,
         added.solution,
         added.covariance,
         name=name,
         version=version,
-        provenance=provenance | history,
+        provenance=provenance,
     )
+    return with_terms(psf, added)
 
 
 def _kernel(added: Corrected) -> Kernel:

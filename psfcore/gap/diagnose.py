@@ -23,12 +23,13 @@ import numpy as np
 from psfcore.arrays import Vector
 from psfcore.errors import DataError
 from psfcore.gap.effect import Effect
-from psfcore.gap.evidence.columns import FieldShape, with_effect
+from psfcore.gap.evidence.columns import FieldShape, another, with_effect
 from psfcore.gap.evidence.effect_fits import EffectFit, fit_effects, label_of, p_value_of_gap
 from psfcore.gap.evidence.expected_gap import ExpectedGap, linear_model_of
 from psfcore.gap.evidence.linear_model import LinearModel
 from psfcore.gap.evidence.measured_noise import MeasuredNoise, measured_noise
 from psfcore.gap.evidence.responses import Evidence
+from psfcore.gap.library.optics import FIELD_DEPENDENT
 from psfcore.gap.library.registry import LIBRARY
 from psfcore.gap.library.scene import MOST_POINTINGS
 from psfcore.gap.verdict.answer import LEAST_IMAGES, Answer, answer_of
@@ -209,18 +210,18 @@ def diagnose(
     order = [name for (_, name), _ in answer.labels.items() if name in effects]
     fits = {name: fit_effects(model, [effects[name]]) for name in dict.fromkeys([*order, *effects])}
     corrected = None
-    if (
-        refit
-        and told is not None
-        and answer.verdict in ("attributed", "tie")
-        and set(told.names) <= set(effects)
-    ):
-        corrected = _refit(view, model, [effects[name] for name in told.names], told, failures, of_refit)
+    if refit and told is not None:
+        # Another form of a change over the field is refitted as the effect of the library that has terms.
+        names = [FIELD_DEPENDENT if name == another("psf_place") else name for name in told.names]
+        settled = answer.verdict in ("attributed", "tie") or FIELD_DEPENDENT in names
+        if settled and set(names) <= set(effects):
+            fit = told if names == list(told.names) else fit_effects(model, [effects[name] for name in names])
+            corrected = _refit(view, model, [effects[name] for name in fit.names], fit, failures, of_refit)
     schemes = (time_blocks(model), pointings(model))
     held_out = [hold_out(model, (), scheme) for scheme in schemes]
     closing = partial(_shrinking, held_out, schemes, rng, bool(answer.causes))
     shrinking = {name: closing(fit)[0] for name, fit in fits.items()}
-    of_told, after = (None, None) if told is None else closing(told, corrected)
+    of_told, after = (None, None) if told is None else closing(told, _of_fit(told, corrected))
     if told is not None and of_told is not None and told.label in shrinking:
         shrinking[told.label] = of_told
     before = held_out[0]
@@ -325,6 +326,11 @@ def _refit(
         return None
     finally:
         return_unused_memory()
+
+
+def _of_fit(told: EffectFit, refit: Corrected | None) -> Corrected | None:
+    """The full refit if it is one of the told causes as they are."""
+    return refit if refit is not None and refit.label == told.label else None
 
 
 def _shrinking(

@@ -142,11 +142,14 @@ class HypothesisJson(TypedDict):
 
 
 class PsfJson(TypedDict):
-    """The parameters of the PSF: refitted without the named effects, and with them."""
+    """The parameters of the PSF: refitted without the named effects, and with them. If the corrected PSF changes over
+    the field: the gap in held-out images that were deconvolved with one kernel, and with its terms.
+    """
 
     shape: str
     refitted: dict[str, ParameterJson]
     with_answer: dict[str, ParameterJson] | None
+    held_out_with_terms: NotRequired[dict[str, object]]
 
 
 class GapReport(TypedDict):

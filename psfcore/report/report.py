@@ -30,6 +30,7 @@ from psfcore.evaluation.report import sentence
 from psfcore.evaluation.shapes import held_out_kernels
 from psfcore.instruments.psf_statements import title
 from psfcore.psf import PLATE_SCALE_TOLERANCE, REACH_GRID_PX, Psf
+from psfcore.psf_sampling import sampling_of
 from psfcore.scatter.fit import TransitFit, fit_json, fit_transit, fitted_psf
 from psfcore.scatter.inversion import Inverter
 from psfcore.scatter.reconstruction import Progress, Solution
@@ -181,9 +182,10 @@ def make_report(
             lambda: _cross_validated(fitted, seed, stages.of("folds")),
         )
         kernels = missing.unless_made("a test on held-out images", lambda: held_out_kernels(fitted))
+    placed = sampling_of(tested, {}, transit.shape).of(tested)
     evaluation = evaluate(
         transit,
-        kernels or (lambda _index: tested.kernel),
+        kernels or (lambda _index: placed),
         seed=seed,
         threads=threads,
         progress=stages.of("evaluating"),

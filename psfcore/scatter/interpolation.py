@@ -230,6 +230,12 @@ def _check_same_telescope(before: Psf, after: Psf) -> None:
         for name, (one, other, tolerance) in pairs.items()
         if not _same(one, other, tolerance)
     ]
+    if before.field_terms or after.field_terms:
+        raise DataError(
+            "psfs-differ",
+            "expected two PSFs without terms FIELD, because PSFs that change over the field are not interpolated in "
+            "time; got at least one with terms: use the PSF of one of the two times",
+        )
     if differ or before.kernel.shape[0] != before.kernel.shape[1]:
         raise DataError(
             "psfs-differ",

@@ -48,8 +48,9 @@ scene, which the model scatters into the disc.
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Self
 
 import numpy as np
@@ -61,6 +62,7 @@ from psfcore.convolution.convolver import Convolver
 from psfcore.convolution.engine import BLOCK_ROWS, Engine, aligned
 from psfcore.convolution.lengths import LANES
 from psfcore.deconvolve.assess.error_planes import sigma_points
+from psfcore.deconvolve.conditions import new_engine
 from psfcore.deconvolve.iterations.linear import (
     LEAST_TRANSFER,
     inverse_filter,
@@ -188,8 +190,10 @@ def possible_psfs(psf: Psf, *, threads: int = 1) -> list[Psf]:
 
 
 def possible_on_pixels(psf: Psf, header: Header, *, threads: int = 1) -> list[Psf]:
-    """The PSFs of `possible_psfs` on the pixels of an image; empty if the errors of the PSF are not known."""
-    if psf.fitted is None:
+    """The PSFs of `possible_psfs` on the pixels of an image; empty if the errors of the PSF are not known, as those of
+    the terms of a PSF that changes over the field.
+    """
+    if psf.fitted is None or psf.field_terms:
         return []
     return [psf_for_image(one, header) for one in possible_psfs(psf, threads=threads)]
 
@@ -202,11 +206,16 @@ class Blur:
     Parameters
     ----------
     kernel
-        Values [y, x] of any sign, centre at [n // 2, n // 2].
+        Values [y, x] of any sign, centre at [n // 2, n // 2]; or a PSF on the pixels of the field, which may change
+        over the field.
     """
 
-    def __init__(self, kernel: Kernel, field_shape: tuple[int, int], *, threads: int = 1) -> None:
-        self.engine = Engine(kernel, field_shape, threads=threads)
+    def __init__(self, kernel: Kernel | Psf, field_shape: tuple[int, int], *, threads: int = 1) -> None:
+        self.engine = (
+            new_engine(kernel, field_shape, field_shape, threads)
+            if isinstance(kernel, Psf)
+            else Engine(kernel, field_shape, threads=threads)
+        )
         self._partly_filled = field_shape[0] % BLOCK_ROWS != 0
 
     def twins(self) -> list[Self]:
@@ -228,15 +237,15 @@ class Blur:
 
     def convolve(self, lanes: Lanes) -> Lanes:
         """H x: the field convolved with the kernel."""
-        return self._through(lanes, self.engine.transfer)
+        return self._through(lanes, partial(self.engine.columns, adjoint=False))
 
     def correlate(self, lanes: Lanes) -> Lanes:
         """H^T y: the field correlated with the kernel. This is the adjoint of `convolve`."""
-        return self._through(lanes, self.engine.transfer, conjugate=True)
+        return self._through(lanes, partial(self.engine.columns, adjoint=True))
 
-    def _through(self, lanes: Lanes, transfer: NDArray[np.float32], *, conjugate: bool = False) -> Lanes:
+    def _through(self, lanes: Lanes, columns: Callable[[], None]) -> Lanes:
         self.engine.rows_forward(lanes)
-        self.engine.multiply_columns(transfer, conjugate=conjugate)
+        columns()
         return self._rows(0, self.engine.row_blocks)
 
     def _rows(self, first: int, stop: int) -> Lanes:
@@ -263,7 +272,7 @@ class Optics(Blur):
         The smallest absolute value of the PSF's Fourier transform.
     """
 
-    def __init__(self, psf_kernel: Kernel, field_shape: tuple[int, int], *, threads: int = 1) -> None:
+    def __init__(self, psf_kernel: Kernel | Psf, field_shape: tuple[int, int], *, threads: int = 1) -> None:
         super().__init__(psf_kernel, field_shape, threads=threads)
         self._inverse = inverse_filter(self.engine)
         self._fields: tuple[Lanes, Lanes] | None = None
@@ -287,7 +296,7 @@ class Optics(Blur):
 
     def invert_once(self, lanes: Lanes, *, adjoint: bool = False) -> Lanes:
         """G y, or G^T y if `adjoint`."""
-        return self._through(lanes, self._inverse, conjugate=adjoint)
+        return self._through(lanes, partial(self.engine.multiply_columns, self._inverse, conjugate=adjoint))
 
     def invert(self, observed: Lanes, start: Lanes | None = None, *, steps: int = STEPS) -> Lanes:
         """The scene x of an observation, from `steps` iterations of Eq. (1).

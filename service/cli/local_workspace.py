@@ -194,7 +194,13 @@ class LocalWorkspace(Workspace):
             return source(key=request.psf_id, built=PsfOrigin.of_instrument(instrument_of_build(named_build)))
         parts, named = request.error_draws > 0, self.inputs.psfs.get(request.psf_id)
         psf = self.psf(request.psf_id, parts=parts)
-        source = partial(source, lambda *_: psf, key=(request.psf_id, parts), kernel_shape=psf.kernel.shape)
+        source = partial(
+            source,
+            lambda *_: psf,
+            key=(request.psf_id, parts),
+            kernel_shape=psf.kernel.shape,
+            field_terms=len(psf.field_terms),
+        )
         if named is None:
             return source()
         return source(

@@ -218,6 +218,7 @@ PSF_SECTIONS = {
         "build": Lazy("service.cli.psf.make", "build", "Compute the PSF of an instrument."),
         "fit": Lazy("service.cli.psf.make", "fit", "Fit the scattered light of a transit."),
         "crossval": Lazy("service.cli.psf.make", "crossval", "Estimate the uncertainty of a fit."),
+        "field": Lazy("service.cli.psf.field", "field", "Make a PSF that changes over the field."),
         "instruments": Lazy("service.cli.psf.versions", "instruments", "List instruments that can be built."),
     },
     "Read": {

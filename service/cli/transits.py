@@ -229,7 +229,8 @@ def _next_step(report: dict[str, Any], transit: str, page: Path | None, correcte
     if report["verdict"] in ("inconclusive", "tie"):
         return "`heliopsf gap plan PLAN` tells whether images that are not taken yet would decide"
     if report["psf"]["with_answer"] is not None and corrected is None:
-        named = " and ".join(name.replace("_", " ") for name in report["answer"])
+        names = report["answer"] or ["field_dependent_scatter"]  # another form of it has no name of its own
+        named = " and ".join(name.replace("_", " ") for name in names)
         return f"`heliopsf gap {transit} --corrected PSF.fits` writes the PSF that was fitted with {named} in the model"
     if any(cause["field"] for cause in report["causes"]):
         where = "-o PAGE.html writes a page with" if page is None else f"{page} has"
@@ -243,6 +244,8 @@ def _lines(report: dict[str, Any]) -> list[str]:
     """
     answer = f" ({', '.join(report['answer'])})" if report["answer"] else ""
     out = [*report["lines"], f"verdict: {report['verdict']}{answer}"]
+    if "held_out_with_terms" in report["psf"]:
+        out.append(f"  {report['psf']['held_out_with_terms']['sentence']}")
     if report["untestable"]:
         out.append(f"  not testable: {', '.join(one['name'] for one in report['untestable'])}")
     return out + [f"  caution: {caution}" for caution in report["cautions"]]

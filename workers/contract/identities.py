@@ -153,7 +153,10 @@ def psf_fit_identity(request: ResolvedPsfFit | ResolvedCrossValidate) -> str:
     """The identity of a fit or a cross-validation: the hash of the transit, the parameters, the diffraction PSF and the
     version of the algorithm.
     """
-    return _transit_identity("psf-fit" if isinstance(request, ResolvedPsfFit) else "cross-validate", request)
+    # Fits without terms of the field keep the ids that they had before there were such terms.
+    excluded = () if request.field else ("field",)
+    kind = "psf-fit" if isinstance(request, ResolvedPsfFit) else "cross-validate"
+    return _transit_identity(kind, request, excluded)
 
 
 def report_identity(request: ResolvedReport) -> str:

@@ -261,6 +261,12 @@ class PsfFit(Parameters):
         False,
         description="also run the published recipe and measure each of its four biases (slow)",
     )
+    field: int = Field(
+        0,
+        ge=0,
+        le=1,
+        description="1: also fit how the scatter changes linearly over the field, and write it as terms of the PSF",
+    )
     noise: TransitNoise = None
     saturation_dn: Saturation = None
     seed: int = Field(
@@ -276,6 +282,7 @@ class CrossValidate(PsfFit):
 
     algorithm_version: ClassVar[int] = 2
     as_published: Literal[False] = False
+    field: Literal[0] = 0
     scheme: Literal["shared", "exact"] = Field(
         "shared",
         description="`shared`: all folds use the same reconstructions; `exact`: each fold makes its own "

@@ -14,6 +14,7 @@ from psfcore.errors import DataError, module_of_extra
 from psfcore.gap.corrected_psf import corrected_psf
 from psfcore.gap.diagnose import Diagnosis, diagnose, start_of
 from psfcore.gap.effect_sources import library_sha256
+from psfcore.gap.field_terms import held_out_gaps
 from psfcore.gap.library.registry import Added, added_effects, library_with
 from psfcore.gap.report.report import gap_report
 from psfcore.psf import Psf
@@ -49,8 +50,8 @@ def gap_diagnose(workspace: Workspace, request: ResolvedGapDiagnose, identity: s
         solution=workspace.inverter(request),
     )
     provenance = {"report_id": identity, **_provenance(request, parent, added, workspace.job_id)}
-    corrected_id = None
-    if request.correct and found.corrected is not None:
+    corrected_id, gaps, refit = None, None, found.corrected
+    if request.correct and refit is not None:
         try:
             corrected = _corrected(found, provenance)
         except DataError as error:
@@ -59,6 +60,10 @@ def gap_diagnose(workspace: Workspace, request: ResolvedGapDiagnose, identity: s
             found = replace(found, cautions=(*found.cautions, caution))
         else:
             corrected_id = corrected.provenance["psf_id"]
+            if corrected.field_terms:
+                gaps = held_out_gaps(
+                    found.solution, found.model, refit, seed=request.seed, progress=workspace.report
+                )
             parents = corrected.provenance["parents"]
             details = {
                 "transit_id": parents["transit"],
@@ -72,6 +77,8 @@ def gap_diagnose(workspace: Workspace, request: ResolvedGapDiagnose, identity: s
             )
     content = gap_report(found)
     content["provenance"] = provenance | {"corrected_psf_id": corrected_id}
+    if gaps is not None:
+        content["psf"]["held_out_with_terms"] = gaps.to_json()
     workspace.add(
         report_result(
             identity,

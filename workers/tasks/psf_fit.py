@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from psfcore.errors import module_of_extra
+from psfcore.gap.field_fit import fit_field
 from psfcore.scatter.fit import fit_json, fit_transit, fitted_psf
 from workers.contract.identities import diffraction_identity
 from workers.contract.requests import ResolvedPsfFit
@@ -10,7 +11,7 @@ from workers.tasks.results import provenance_of, psf_result
 from workers.tasks.transits import load_transit
 from workers.tasks.workspace import Workspace, task_of
 
-_SHOWN = ("sentence", "shape", "parameters", "curve", "chi2_per_pixel", "converged", "limits")
+_SHOWN = ("sentence", "shape", "parameters", "curve", "chi2_per_pixel", "converged", "limits", "field")
 
 
 @task_of("psf-fit")
@@ -32,12 +33,18 @@ def psf_fit(workspace: Workspace, request: ResolvedPsfFit, identity: str) -> Non
         **provenance_of(workspace.job_id, request),
     }
     name = f"{transit.instrument or 'transit'}-fitted"
-    psf = fitted_psf(fit, name=name, version=f"0.1.0+{identity[:8]}", provenance=provenance)
+    version = f"0.1.0+{identity[:8]}"
     report = fit_json(fit) | {"prepared": prepared.to_json(), "provenance": provenance}
+    if request.field:
+        field = fit_field(fit.solution, seed=request.seed, progress=workspace.report)
+        psf = field.psf(name, version, provenance)
+        report["field"] = field.to_json()
+    else:
+        psf = fitted_psf(fit, name=name, version=version, provenance=provenance)
     details = {
         "transit_id": request.transit_id,
         "diffraction_psf_id": diffraction_identity(request),
-        "fit": {key: report[key] for key in _SHOWN},
+        "fit": {key: report[key] for key in _SHOWN if key in report},
     }
     workspace.add(
         psf_result(

@@ -105,7 +105,8 @@ def _arrays(workspace: CatalogueWorkspace, row: Thing) -> dict[str, NDArray[np.g
     """The image arrays of a product or PSF file, by name."""
     if isinstance(row, PsfRow):
         psf = workspace.psf_of(row)
-        return {"PSF": psf.kernel, **psf.components}
+        terms = {f"FIELD {one.x_power} {one.y_power}": one.kernel for one in psf.field_terms}
+        return {"PSF": psf.kernel, **psf.components, **terms}
     path = workspace.store.verified(row.file_sha256)
     return {"IMAGE": read_plane(path, workspace.limits), **read_planes(path)}
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from psfcore.errors import module_of_extra
 from psfcore.fits.psfs import write_psf
-from psfcore.psf import Psf, light_beyond_pct
+from psfcore.psf import Psf, field_map, light_beyond_pct
 from workers.contract.kinds import ResultType
 from workers.contract.requests import Parameters
 from workers.settings import library_versions, software_version
@@ -63,6 +63,7 @@ def psf_result(
             "plate_scale_arcsec": psf.plate_scale_arcsec,
             "wavelength_angstrom": psf.wavelength_angstrom,
             "components": sorted(psf.components),
+            **({"field": field_map(psf)} if psf.field_terms else {}),
             "cumulative_curve_pct": light_beyond_pct(psf.kernel),
             "provenance": psf.provenance,
             **details,

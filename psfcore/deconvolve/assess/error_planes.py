@@ -46,8 +46,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from psfcore.convolution.engine import Engine
-from psfcore.deconvolve.conditions import Conditions, Progress
+from psfcore.deconvolve.conditions import Conditions, Progress, new_engine
 from psfcore.deconvolve.edges import inside_band
 from psfcore.errors import DataError
 from psfcore.fits.units import dn_per_unit
@@ -145,9 +144,9 @@ def expected_image(image: Image, estimate: Plane, psf: Psf, *, threads: int = 1)
     """The image [y, x] without noise that is expected of the scene `estimate`, m of Eq. (1). It is not below zero."""
     finite = np.isfinite(estimate)
     scene = np.where(finite, estimate, _local_mean(estimate, finite, MODEL_WINDOW_PX))
-    convolved = np.maximum(
-        Engine(psf.kernel, scene.shape, threads=threads).apply(scene).astype(np.float64), 0.0
-    )
+    ny, nx = scene.shape
+    engine = new_engine(psf, (ny, nx), (ny, nx), threads)
+    convolved = np.maximum(engine.apply(scene).astype(np.float64), 0.0)
     observed = np.maximum(_local_mean(image.pixels, image.valid, MODEL_WINDOW_PX), 0.0)
     model = _local_mean(convolved, image.valid, MODEL_WINDOW_PX)
     ratio = np.divide(observed, model, out=np.ones_like(model), where=model > 0)

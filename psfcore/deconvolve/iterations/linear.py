@@ -4,7 +4,8 @@
 
 H is the convolution with the PSF, cut to the field. T is the PSF's Fourier transform on the padded, periodic plane.
 Where abs(T) is at least t (LEAST_TRANSFER), G = 1 / T, which inverts H except for light that crosses the edge of the
-field; a few steps correct for this light. Where abs(T) is below t, Eq. (1) is a Landweber step: frequencies at which
+field; a few steps correct for this light. If the PSF changes over the field, T is the transform of K0, and the steps
+also correct for the change. Where abs(T) is below t, Eq. (1) is a Landweber step: frequencies at which
 the PSF has little power are restored slowly, and the noise at these frequencies is amplified slowly.
 
 The method does not force the scene to be positive, so faint pixels have no bias. For one PSF, the method amplifies the
@@ -46,7 +47,7 @@ from psfcore.convolution.engine import (
     Engine,
     Lines,
     Single,
-    clear_beyond,
+    clear_rows_beyond,
     rows_from_spectrum,
     rows_to_spectrum,
 )
@@ -67,7 +68,7 @@ def solve(problem: Problem) -> Deconvolved:
     """The result of Eq. (1), with its noise amplification."""
     result = problem.solve(Additive(problem, inverse_filter(problem.engine)))
     sample = transfer_sample(problem.engine)
-    g = np.conj(sample.values) / np.maximum(np.abs(sample.values) ** 2, LEAST_TRANSFER**2)
+    g = np.conj(sample.central) / np.maximum(np.abs(sample.central) ** 2, LEAST_TRANSFER**2)
     return replace(result, noise_amplification=noise_amplification(sample, g, result.steps_done))
 
 
@@ -110,7 +111,8 @@ class Additive(LinearIteration):
 
     def measure(self) -> None:
         self.engine.columns(adjoint=False)
-        self.engine.row_stage(_residual_rows, self.observed, self.judgement, _all_rows(self.engine))
+        rows = _all_rows(self.engine)
+        self.engine.row_stage(_residual_rows, self.observed, self.judgement, rows, before_h=False)
 
     def update(self, *, last: bool) -> None:
         self.engine.multiply_columns(self._step_filter)
@@ -153,7 +155,7 @@ def solve_linear(
     engine.rows_forward(x)
     for left in reversed(range(steps)):
         engine.columns(adjoint=False)
-        engine.row_stage(_residual_rows, observed, nothing, rows)
+        engine.row_stage(_residual_rows, observed, nothing, rows, before_h=False)
         engine.multiply_columns(step_filter)
         engine.row_stage(_add_rows, x, left > 0, changes, rows)
         if relative_change(*changes.sum(axis=1)) < settled:
@@ -163,23 +165,40 @@ def solve_linear(
 
 @dataclass(frozen=True, eq=False)
 class TransferSample:
-    """Values of T at some frequencies (float64 or complex128) and the weights of these frequencies, which sum to 1."""
+    """Values of T at some frequencies (float64 or complex128) and the weights of these frequencies, which sum to 1.
+
+    Attributes
+    ----------
+    central
+        The values from which the filter G of Eq. (1) is made: those of K0 if the PSF changes over the field, else
+        `values`.
+    """
 
     values: NDArray[np.floating] | NDArray[np.complexfloating]
     weights: NDArray[np.float64]
+    central: NDArray[np.floating] | NDArray[np.complexfloating]
 
 
 def transfer_sample(engine: Engine) -> TransferSample:
-    """A sample of an engine's transfer function: along y, every k-th frequency (k: first radix of its transform)."""
+    """A sample of an engine's transfer function: along y, every k-th frequency (k: first radix of its transform). If
+    the PSF changes over the field, the sample has the transfer functions at nine places.
+    """
     rows = int(engine.column_plan.lengths[1])
-    lanes = engine.transfer[:, :rows].astype(np.float64) * engine.transfer_scale
-    values = lanes[:, :, 0] if engine.symmetric else lanes[:, :, 0] + 1j * lanes[:, :, 1]
     # Frequencies along x run from 0 to L / 2. Except the first and last, each also represents its negative.
     k, half = np.arange(engine.column_blocks * LANES), engine.row_plan.length // 2
     times = np.where((k == 0) | (k == half), 1.0, np.where(k < half, 2.0, 0.0))
-    weights = np.broadcast_to(times.reshape(-1, 1, LANES), values.shape)
+    weights = np.broadcast_to(times.reshape(-1, 1, LANES), (engine.column_blocks, rows, LANES))
     used = weights > 0
-    return TransferSample(values[used], weights[used] / weights[used].sum())
+    values = np.array([_complex(engine, one)[used] for one in engine.local_transfers(rows)])
+    weights = np.tile(weights[used], len(values))
+    central = np.array([_complex(engine, engine.transfer[:, :rows])[used]] * len(values))
+    return TransferSample(values.reshape(-1), weights / weights.sum(), central.reshape(-1))
+
+
+def _complex(engine: Engine, transfer: Single) -> NDArray[np.float64] | NDArray[np.complex128]:
+    """The values of T in some rows of a transfer function, [block of columns][row][lane]."""
+    lanes = transfer.astype(np.float64) * engine.transfer_scale
+    return lanes[:, :, 0] if engine.symmetric else lanes[:, :, 0] + 1j * lanes[:, :, 1]
 
 
 def noise_amplification(
@@ -224,7 +243,7 @@ def _residual_rows(
             if judgement.first <= i < judgement.last:
                 sum_here += sum_row
         judgement.sums[block] = sum_here
-        clear_beyond(z, rows - block * 2 * LANES, nx)
+        clear_rows_beyond(z, rows - block * 2 * LANES, nx)
         rows_to_spectrum(lines, block, nx)
 
 
@@ -253,7 +272,7 @@ def _add_rows(
             moved += moved_row
             total += total_row
         changes[0, block], changes[1, block] = moved, total
-        clear_beyond(z, rows - block * 2 * LANES, nx)
-        clear_beyond(x[block], rows - block * 2 * LANES, nx)
+        clear_rows_beyond(z, rows - block * 2 * LANES, nx)
+        clear_rows_beyond(x[block], rows - block * 2 * LANES, nx)
         if again:
             rows_to_spectrum(lines, block, nx)

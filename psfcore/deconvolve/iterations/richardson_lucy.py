@@ -86,7 +86,7 @@ class LucyIteration(Iteration):
 
     def measure(self) -> None:
         self.engine.columns(adjoint=False)
-        self.engine.row_stage(_ratio_rows, self._light_or_agreed, self.floor, self.judgement)
+        self.engine.row_stage(_ratio_rows, self._light_or_agreed, self.floor, self.judgement, before_h=False)
 
 
 class RichardsonLucy(LucyIteration):

@@ -40,6 +40,7 @@ BLURS = (
 BETWEEN = 6  # number of parts into which the interval between the neighbours of the best step is divided
 SPLINE = 3  # order of the interpolation; a linear interpolation (order 1) would blur a rotated pattern
 AMOUNT = SOFTENED_POWER_LAW.names.index("total")  # the coordinate of the total scatter
+FIELD_DEPENDENT = "field_dependent_scatter"
 
 
 @dataclass(frozen=True)
@@ -264,7 +265,7 @@ EFFECTS: tuple[Effect, ...] = (
            "Scatter reaches farther along one direction. p and q are ln(1 + stretch) times the cosine and the sine of twice the angle of this direction.",
            "a transit along a second track that crosses the first", ("azimuth_in_disc", "detector_x", "detector_y"),
            _anisotropic, _not_a_power_law, family="psf"),
-    Effect("field_dependent_scatter", "optics",
+    Effect(FIELD_DEPENDENT, "optics",
            (Parameter("x", "/field", 0.1), Parameter("y", "/field", 0.1), Parameter("outwards", "/field2", 0.2)),
            "The total scatter varies across the detector, linearly or from its centre outwards.", "a transit across another part of the detector",
            ("detector_x", "detector_y"), _field_dependent, _not_a_power_law, family="psf_place"),

@@ -86,7 +86,7 @@ TOLD_PX = (10, 100)  # the JSON and `psf show` have the curve at more radii
 @click.option("-o", "--output", required=True, type=OUTPUT, help="Write the PSF (FITS)")
 @JSON
 @PLOT
-@options_of(PsfFit, "shape", "as_published", "noise", "saturation_dn")
+@options_of(PsfFit, "shape", "field", "as_published", "noise", "saturation_dn")
 @SERVER_OR_LOCAL
 @writes_files
 def fit(
@@ -109,6 +109,8 @@ def fit(
     found = fitted["details"]["fit"]
     echo(f"{output}: {title(fitted['name'], fitted['version'], fitted['status'])}, id {short(fitted['id'])}")
     say_fit(found)
+    for line in found.get("field", {}).get("lines", ()):
+        echo(f"  {line}")
     for limit in found["limits"]:
         echo(f"  note: {limit}")
     here = " --local" if is_local() else ""
@@ -163,7 +165,7 @@ def show(file: Path, plot: Path | None, overwrite: bool) -> None:
     import numpy as np
 
     from psfcore.fits.psfs import read_psf
-    from psfcore.psf import cumulative_curve
+    from psfcore.psf import cumulative_curve, light_beyond_map
 
     psf = read_psf(file, psf_limits())
     if plot is not None:
@@ -185,6 +187,17 @@ def show(file: Path, plot: Path | None, overwrite: bool) -> None:
     echo(f"{'R (px)':>8}" + "".join(f"{name:>15}" for name in kernels))
     for n, radius in enumerate(radii):
         echo(f"{radius:>8g}" + "".join(f"{curve[n]:>15.3f}" for curve in curves.values()))
+    if psf.place is None:
+        return
+    terms = ", ".join(f"x^{term.x_power} y^{term.y_power}" for term in psf.field_terms)
+    nx, ny = psf.place.detector
+    echo(
+        f"\nchanges over the field of {nx} x {ny} px (terms {terms}); above: at its centre\n"
+        "light beyond R in percent at the corners, the edges and the centre, y upwards:"
+    )
+    for radius, places in zip(radii, light_beyond_map(psf, radii), strict=True):
+        for n, row in enumerate(places[::-1]):
+            echo((f"{radius:>8g}" if n == 0 else " " * 8) + "".join(f"{pct:>10.3f}" for pct in row))
 
 
 def _mask_of(instrument: str, folder: str) -> Path | None:

@@ -34,7 +34,9 @@ def test_the_transforms_are_those_of_the_engine() -> None:
     psf = make_psf(weights / weights.sum())
     engines: list[Engine] = []
 
-    def engine_for(psf: Psf, plane: tuple[int, int], span: tuple[int, int], threads: int) -> Engine:
+    def engine_for(
+        psf: Psf, plane: tuple[int, int], span: tuple[int, int], threads: int, margin_px: int
+    ) -> Engine:
         engines.append(Engine(psf.kernel, plane, span=span, threads=threads))
         return engines[-1]
 
