@@ -17,7 +17,8 @@ from astropy.io.fits import Header
 from numpy.typing import NDArray
 
 from psfcore import software_version
-from psfcore.deconvolve.assess.changes import MEANINGS, bright_and_dark_change_pct
+from psfcore.deconvolve.assess.changes import bright_and_dark_change_pct
+from psfcore.deconvolve.assess.quality import MEANINGS
 from psfcore.deconvolve.conditions import Deconvolved, PreparedPsfs, Progress
 from psfcore.deconvolve.declaration import check_stop
 from psfcore.deconvolve.doubts import input_warnings

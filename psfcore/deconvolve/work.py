@@ -46,7 +46,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.deconvolve.assess.changes import Changes, QualityBit, measure_changes, quality_plane
+from psfcore.deconvolve.assess.changes import Changes, measure_changes
+from psfcore.deconvolve.assess.quality import QualityBit, quality_plane
 from psfcore.deconvolve.box import LARGEST_ERROR, Box, region_without_discrepancy, region_without_errors
 from psfcore.deconvolve.conditions import Conditions, Deconvolved, OfBox, Progress, fluxes, new_engine
 from psfcore.deconvolve.declaration import WITHOUT_MARGIN, Edges

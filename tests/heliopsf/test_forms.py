@@ -19,7 +19,7 @@ from astropy.wcs.wcsapi import HighLevelWCSWrapper, SlicedLowLevelWCS
 
 import heliopsf
 from heliopsf import DataError, DataWarning
-from psfcore.deconvolve.assess.changes import QualityBit
+from psfcore.deconvolve.assess.quality import QualityBit
 from psfcore.psf_sampling import rebinned_kernel
 
 SHAPE = (96, 128)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 import heliopsf
 from heliopsf import DataError, Deconvolution
 from heliopsf.inputs import image_of, on_disk
-from psfcore.deconvolve.assess.changes import QualityBit
+from psfcore.deconvolve.assess.quality import QualityBit
 from psfcore.fits.cards import number_of
 from psfcore.image import Image
 

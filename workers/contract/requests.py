@@ -105,7 +105,8 @@ class _Method(Parameters):
         description="`fixed`: do all `steps`; `discrepancy`: stop once the residual is like the noise",
     )
     edges: Annotated[Edges | None, Option(metavar="SCENE")] = Field(
-        None, description="scene beyond the field: zero, symmetric, extended or periodic; null: depends on the method"
+        None,
+        description="scene beyond the field: zero, symmetric, extended or periodic; null: depends on the method",
     )
     margin_px: int | None = Field(
         None,

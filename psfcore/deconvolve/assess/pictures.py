@@ -21,7 +21,8 @@ from matplotlib.colors import LogNorm, Normalize, SymLogNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from psfcore.deconvolve.assess.changes import Changes, QualityBit, block_means
+from psfcore.deconvolve.assess.changes import Changes, block_means
+from psfcore.deconvolve.assess.quality import QualityBit
 from psfcore.deconvolve.summary import LOOK_FROM
 from psfcore.drawing.plots import (
     CHANGE,

@@ -11,7 +11,7 @@ from astropy.io.fits import Header
 from scipy.ndimage import gaussian_filter
 
 from psfcore.convolution.convolver import Convolver
-from psfcore.deconvolve.assess.changes import QualityBit
+from psfcore.deconvolve.assess.quality import QualityBit
 from psfcore.deconvolve.box import Box
 from psfcore.deconvolve.methods.registry import method_names
 from psfcore.deconvolve.work import BoxWork, Options, Work, box_work

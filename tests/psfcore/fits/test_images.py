@@ -15,7 +15,7 @@ from astropy.io import fits
 from astropy.wcs import WCS
 from numpy.typing import NDArray
 
-from psfcore.deconvolve.assess.changes import MEANINGS, QualityBit
+from psfcore.deconvolve.assess.quality import MEANINGS, QualityBit
 from psfcore.errors import DataError
 from psfcore.fits.header import read_summary
 from psfcore.fits.images import described, read_mask_image, read_planes, write_image

@@ -13,7 +13,7 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 import heliopsf
-from psfcore.deconvolve.assess.changes import QualityBit
+from psfcore.deconvolve.assess.quality import QualityBit
 from psfcore.deconvolve.doubts import pixel_warnings
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits

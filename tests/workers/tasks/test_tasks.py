@@ -13,7 +13,7 @@ from astropy.io import fits
 
 from psfcore.deconvolve import conditions, run, work
 from psfcore.deconvolve.assess import pictures
-from psfcore.deconvolve.assess.changes import QualityBit
+from psfcore.deconvolve.assess.quality import QualityBit
 from psfcore.drawing import plots
 from service.client.http import ServiceError
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf

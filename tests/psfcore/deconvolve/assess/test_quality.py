@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from psfcore.deconvolve.assess.changes import NEAR_MASKED_PX, QualityBit, quality_plane
+from psfcore.deconvolve.assess.quality import NEAR_MASKED_PX, QualityBit, quality_plane
 from psfcore.image import MaskBit
 from psfcore.psf import Psf
 from psfcore.simulate.scene import observe
