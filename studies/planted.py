@@ -75,7 +75,7 @@ FAULTS = (
           'np.float32((read_noise / domain.scale) ** 2)', 'np.float32(read_noise / domain.scale)'),
     Fault("deconvolve-same-noise-in-every-draw", "psfcore/deconvolve/assess/error_planes.py",
           'np.random.default_rng([seed, k])', 'np.random.default_rng(seed)'),
-    Fault("deconvolve-near-masked-radius-short", "psfcore/deconvolve/assess/changes.py",
+    Fault("deconvolve-near-masked-radius-short", "psfcore/deconvolve/assess/quality.py",
           'if dy**2 + dx**2 <= radius_px**2', 'if dy**2 + dx**2 < radius_px**2'),
     Fault("deconvolve-region-shares-inverted", "psfcore/deconvolve/work.py",
           '* light.kept - light.light) / light.shares', '* light.kept - light.light) * light.shares'),
