@@ -60,7 +60,9 @@ def parts_of_equal_size(values: Values, count: int) -> Groups:
     starts = np.cumsum(size + (np.arange(count - 1) < more))
     parts = np.zeros(values.size, np.uint8)
     ((borders, below),) = _at_ranks(values, parts, [starts.tolist()])
-    _cut(values, borders, starts - below, parts)
+    equal, first = np.zeros(borders.size, np.int64), np.zeros(_BINS, np.uint8)
+    bits = values.view(np.int32), borders.view(np.int32)
+    _cut(values, bits[0], borders, bits[1], starts - below, equal, first, parts)
     return parts
 
 
@@ -71,7 +73,8 @@ def _at_ranks(
     are smaller.
     """
     counts = np.zeros((len(ranks), _BINS), np.int64)
-    _count(values, groups, counts)
+    bits = values.view(np.int32)
+    _count(bits, groups, counts)
     below = np.cumsum(counts, axis=1)
     wanted = np.zeros(counts.shape, np.bool_)
     bins = [
@@ -83,7 +86,7 @@ def _at_ranks(
     sizes = np.where(wanted, counts, 0).sum(axis=1)
     ends = np.cumsum(sizes)
     chosen = np.empty(ends[-1], np.float32)
-    _collect(values, groups, wanted, ends - sizes, chosen)
+    _collect(values, bits, groups, wanted, ends - sizes, chosen)
     found = []
     for group, of_group in enumerate(bins):
         ordered = chosen[ends[group] - sizes[group] : ends[group]]
@@ -103,27 +106,32 @@ def _bin(bits: int) -> int:
     return ((bits ^ ((bits >> 31) & 0x7FFFFFFF)) >> _SHIFT) + _BINS // 2
 
 
+# Views and new arrays are made by the callers: to compile them would take as long as all the rest.
+
+
 @compiled()
-def _count(values: Values, groups: Groups, counts: NDArray[np.int64]) -> None:
-    """Add the number of values in each bin of each group to counts [group, bin]."""
-    bits = values.view(np.int32)
+def _count(bits: NDArray[np.int32], groups: Groups, counts: NDArray[np.int64]) -> None:
+    """Add the number of values with these bits in each bin of each group to counts [group, bin]."""
     for n in range(bits.size):
         counts[groups[n], _bin(bits[n])] += 1
 
 
 @compiled()
 def _collect(
-    values: Values, groups: Groups, wanted: NDArray[np.bool_], starts: NDArray[np.intp], chosen: Values
+    values: Values,
+    bits: NDArray[np.int32],
+    groups: Groups,
+    wanted: NDArray[np.bool_],
+    place: NDArray[np.intp],
+    chosen: Values,
 ) -> None:
     """Copy the values in the wanted bins [group, bin].
 
     Parameters
     ----------
-    starts
-        The place of the first value of each group in `chosen`.
+    place
+        The place of the next value of each group in `chosen`.
     """
-    bits = values.view(np.int32)
-    place = starts.copy()
     for n in range(bits.size):
         if wanted[groups[n], _bin(bits[n])]:
             chosen[place[groups[n]]] = values[n]
@@ -131,17 +139,28 @@ def _collect(
 
 
 @compiled()
-def _cut(values: Values, borders: Values, lower: NDArray[np.int64], parts: Groups) -> None:
+def _cut(
+    values: Values,
+    bits: NDArray[np.int32],
+    borders: Values,
+    bits_of_borders: NDArray[np.int32],
+    lower: NDArray[np.int64],
+    equal: NDArray[np.int64],
+    first: Groups,
+    parts: Groups,
+) -> None:
     """Write the part of each value: the number of borders below it.
 
     Parameters
     ----------
     lower
         For each border, how many of the values that equal the border count as below it.
+    equal
+        Zeros, which become the number of values that equal each border.
+    first
+        Zeros, which become the number of borders in lower bins.
     """
-    bits, equal = values.view(np.int32), np.zeros(borders.size, np.int64)
-    first = np.zeros(_BINS, np.uint8)  # the number of borders in lower bins
-    for bit in borders.view(np.int32):
+    for bit in bits_of_borders:
         for place in range(_bin(bit) + 1, _BINS):  # to add to a slice would compile two seconds longer
             first[place] += 1
     for n in range(values.size):
