@@ -8,17 +8,20 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from functools import cached_property, update_wrapper
+from functools import update_wrapper
 from importlib import import_module
 from pathlib import Path
 from threading import RLock
 from types import FunctionType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from psfcore.kernel_files import KernelFiles, folders_of, source_stamp
 from psfcore.machine_code import Linked, Unlinkable
+
+if TYPE_CHECKING:
+    from numba.core.ccallback import CFunc
 
 # One thread at a time loads or compiles kernels.
 _LOADING = RLock()
@@ -76,7 +79,7 @@ class Later:
     def __init__(self, module: str) -> None:
         self._module = module
 
-    @cached_property
+    @property
     def for_compiler(self) -> object:
         """The module."""
         return import_module(self._module)
@@ -91,6 +94,7 @@ class Kernel:
         update_wrapper(self, function)
         self._function, self._options = function, options
         self._entries: dict[str, Callable[..., Any]] = {}
+        self._for_compiler: Callable[..., Any] | None = None
         self.files = _files_of(function)
         KERNELS.append(self)
 
@@ -109,13 +113,17 @@ class Kernel:
         linked = _linked(self.files, kinds)
         return self.for_compiler if linked is None else linked.function(self.__qualname__)
 
-    @cached_property
+    @property
     def for_compiler(self) -> Callable[..., Any]:
         """The kernel as numba knows it: numba compiles it for further types, and into kernels that call it."""
-        from psfcore.compiling import dispatcher
+        with (
+            _LOADING
+        ):  # not a cached_property, whose own lock another thread may hold while it waits for this one
+            if self._for_compiler is None:
+                from psfcore.compiling import dispatcher
 
-        with _LOADING:
-            return dispatcher(_for_compiler(self._function), self._options, self.files)
+                self._for_compiler = dispatcher(_for_compiler(self._function), self._options, self.files)
+            return self._for_compiler
 
 
 class Addressed:
@@ -123,26 +131,26 @@ class Addressed:
 
     def __init__(self, function: Callable[..., None], signature: str, options: dict[str, Any]) -> None:
         self._function, self._signature, self._options = function, signature, options
+        self._code: Linked | CFunc[Callable[..., None]] | None = None
         self.__qualname__ = function.__qualname__
         self.files = _files_of(function)
         KERNELS.append(self)
 
-    @cached_property
+    @property
     def address(self) -> int:
         """The address of the machine code, which is valid until this process ends. The kernel is loaded from disk, or
         compiled if it is not kept there.
         """
         with _LOADING:
-            linked = _linked(self.files, self._signature)
-            if linked is not None:
-                self._kept: object = linked
-                return linked.address
-            from psfcore.compiling import callback
+            if self._code is None:
+                self._code = _linked(self.files, self._signature)
+            if self._code is None:
+                from psfcore.compiling import callback
 
-            kernel = callback(_for_compiler(self._function), self._signature, self._options, self.files)
-            self._kept = kernel
-            assert kernel.address is not None  # it is compiled
-            return kernel.address
+                twin = _for_compiler(self._function)
+                self._code = callback(twin, self._signature, self._options, self.files)
+            assert self._code.address is not None  # it is compiled
+            return self._code.address
 
 
 def compiled(

@@ -2,7 +2,7 @@
 
 On a new installation both take long. numba compiles in one thread at a time and keeps the interpreter busy, so a thread
 would not help. The process finds out which kernels are needed by deconvolving a small image, and compiles the passes of
-the transforms for the shape of the real image; `psfcore.compiled` keeps all of them on disk.
+the transforms for the shape of the real image; `psfcore.kernel_files` keeps all of them on disk.
 """
 
 from __future__ import annotations

@@ -302,7 +302,7 @@ def _cover(strip, area, ranges, first_row, line, edges, outline_of_edge, first_e
         entry, stop = first_entry[row], first_entry[row + 1]
         while entry < stop:
             outline = outline_of_edge[entries[entry]]
-            touched = 0
+            touched = np.int64(0)  # for a literal 0, `_insert` would be compiled twice
             while entry < stop and outline_of_edge[entries[entry]] == outline:
                 begin, end = _add_edge(area, edges[entries[entry]], row, cells)
                 entry += 1
