@@ -20,6 +20,7 @@ from psfcore.shares import shared_out
 
 Values = NDArray[np.float32]
 Groups = NDArray[np.uint8]
+Bits = NDArray[np.int32]
 Counts = NDArray[np.int32]
 _BINS, _SHIFT = 1 << 16, 16
 _MINUS_ZERO, _LOWER_31 = -(1 << 31), (1 << 31) - 1
@@ -62,12 +63,12 @@ class Portions:
         """Where each portion ends among all numbers."""
         return np.cumsum(self.sizes)
 
-    def portion(self, n: int) -> tuple[Values, Groups]:
-        """The numbers and the groups of a portion."""
-        values = self.read(n)
+    def portion(self, n: int) -> tuple[Bits, Groups]:
+        """The bits of the numbers, and the groups of a portion."""
+        bits = self.read(n).view(np.int32)
         if self.groups is None:
-            return values, np.zeros(values.size, np.uint8)
-        return values, self.groups[self.ends[n] - values.size : self.ends[n]]
+            return bits, np.zeros(bits.size, np.uint8)
+        return bits, self.groups[self.ends[n] - bits.size : self.ends[n]]
 
 
 def percentiles(values: NDArray[np.generic] | Portions, levels: Sequence[float]) -> NDArray[np.float64]:
@@ -119,7 +120,15 @@ def parts_of_equal_size(portions: Portions, count: int) -> tuple[Groups, NDArray
     parts = np.empty(size, np.uint8)
     for n, end in enumerate(portions.ends):  # in order, because of equal numbers
         numbers = portions.read(n)
-        _cut(numbers, borders, in_lower_bins, lower, equal, parts[end - numbers.size : end])
+        _cut(
+            numbers,
+            numbers.view(np.int32),
+            borders,
+            in_lower_bins,
+            lower,
+            equal,
+            parts[end - numbers.size : end],
+        )
     return parts, np.mean(middles, axis=0, dtype=np.float64)
 
 
@@ -192,24 +201,26 @@ def _key(bits: int) -> int:
     return bits ^ ((bits >> 31) & _LOWER_31)
 
 
+# Views are made by the callers: to compile them would take as long as all the rest.
+
+
 @compiled()
-def _count_upper(values: Values, groups: Groups, counts: Counts) -> None:
-    """Add the number of values in each bin of each group to counts [group, bin]."""
-    bits = values.view(np.int32)
+def _count_upper(bits: Bits, groups: Groups, counts: Counts) -> None:
+    """Add the number of values with these bits in each bin of each group to counts [group, bin]."""
     for n in range(bits.size):
         counts[groups[n], (_key(bits[n]) >> _SHIFT) + _BINS // 2] += 1
 
 
 @compiled()
-def _count_lower(values: Values, groups: Groups, numbers: NDArray[np.int16], counts: Counts) -> None:
-    """Add the number of values with each lower half of a key, in each wanted bin, to counts [number of the bin, half].
+def _count_lower(bits: Bits, groups: Groups, numbers: NDArray[np.int16], counts: Counts) -> None:
+    """Add the number of values with these bits, in each wanted bin, to counts [number of the bin, lower half of the
+    key].
 
     Parameters
     ----------
     numbers
         The number of each bin [group, bin]; below 0: not wanted.
     """
-    bits = values.view(np.int32)
     for n in range(bits.size):
         key = _key(bits[n])
         number = numbers[groups[n], (key >> _SHIFT) + _BINS // 2]
@@ -220,6 +231,7 @@ def _count_lower(values: Values, groups: Groups, numbers: NDArray[np.int16], cou
 @compiled()
 def _cut(
     values: Values,
+    bits: Bits,
     borders: Values,
     in_lower_bins: NDArray[np.intp],
     lower: NDArray[np.int64],
@@ -237,7 +249,6 @@ def _cut(
     equal
         For each border, how many values equalled it before; it is counted on.
     """
-    bits = values.view(np.int32)
     for n in range(values.size):
         part = np.int64(in_lower_bins[(_key(bits[n]) >> _SHIFT) + _BINS // 2])
         while part < borders.size and borders[part] < values[n]:
