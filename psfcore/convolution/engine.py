@@ -145,14 +145,13 @@ class Engine:
         span = span or field_shape
         periodic = span == PERIODIC
         # Weights farther than half of a period are left out.
-        kernel, first = needed_kernel(
-            psf_kernel, (field_shape[0] // 2, field_shape[1] // 2) if periodic else span
-        )
+        self._joined = (field_shape[0] // 2, field_shape[1] // 2) if periodic else span
+        kernel, first = needed_kernel(psf_kernel, self._joined)
         ly, lx = (
             periodic_length(size)
             if periodic
             else good_length(max(size, joined + max(-low, low + count - 1, 0)))
-            for size, joined, low, count in zip(field_shape, span, first, kernel.shape, strict=True)
+            for size, joined, low, count in zip(field_shape, self._joined, first, kernel.shape, strict=True)
         )
         self.row_plan, self.column_plan = make_plan(lx), make_plan(ly)
         ny, nx = field_shape

@@ -101,7 +101,7 @@ class FieldEngine(Engine):
     ) -> None:
         kernels = common_shape(np.asarray(psf_kernel, np.float64), terms)
         super().__init__(kernels[0], field_shape, span=span, threads=threads)
-        others = [self._transfer_function(*needed_kernel(one, span or field_shape)) for one in kernels[1:]]
+        others = [self._transfer_function(*needed_kernel(one, self._joined)) for one in kernels[1:]]
         parts = max(one.shape[2] for one in (self.transfer, *others))
         self._transfers = aligned(len(kernels), *self.transfer.shape[:2], parts, LANES)
         for target, one in zip(self._transfers, (self.transfer, *others), strict=True):

@@ -139,7 +139,7 @@ def share_from_beyond(psf: Psf) -> NDArray[np.float64]:
     """
     kernels = common_shape(psf.kernel, psf.field_terms)
     along_y, along_x = (np.array([one.sum(axis=axis) for one in kernels]) for axis in (1, 0))
-    places = nine_places() if psf.field_terms else [(0.0, 0.0)]
+    places = list(nine_places()) if psf.field_terms else [(0.0, 0.0)]
     factors = [np.array([1.0, *(term.at(u, v) for term in psf.field_terms)]) for u, v in places]
     return np.asarray(np.max([_share(of @ along_y, of @ along_x) for of in factors], axis=0))
 
@@ -162,14 +162,14 @@ def light_across(image: Image, psf: Psf) -> float:
     """Compute w of Eq. (2): with periodic edges, no pixel gets more light than this from beyond the edges, if the
     brightness of the scene is that of the image.
     """
-    across = 0.0
+    across, places = 0.0, list(nine_places()) if psf.field_terms else [(0.0, 0.0)]
     for axis, n in enumerate(image.pixels.shape):
         others = 1 - axis
         brightest = np.maximum(
             image.pixels.max(axis=others, where=image.finite, initial=0.0),
             -image.pixels.min(axis=others, where=image.finite, initial=0.0),
         )
-        weights = psf.kernel.sum(axis=others)
+        weights = np.max([psf.at(u, v).sum(axis=others) for u, v in places], axis=0)
         light, first = np.convolve(brightest, weights), weights.size // 2
         across += float(np.concatenate([light[:first], light[first + n :]]).max(initial=0.0))  # Eq. (2)
     return across

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import Convolver
+from psfcore.convolution.engine import PERIODIC
 from psfcore.convolution.field_engine import FieldEngine
 from psfcore.psf_field import FieldTerm, Place
 from tests.psfcore.conftest import gaussian
@@ -40,6 +41,16 @@ def test_equals_the_direct_sum_at_48_px() -> None:
         terms = [FieldTerm(lopsided(9 + 4 * n, rng), *POWERS[n]) for n in range(count)]
         found = FieldEngine(kernel, terms, (u, v), (48, 45), threads=2).apply(scene)
         assert np.abs(found - plain_sum(kernel, terms, u, v, scene)).max() < 1e-6, count
+
+
+def test_a_periodic_field_continues_with_its_opposite_side() -> None:
+    rng = np.random.default_rng(2)
+    term, scene = FieldTerm(lopsided(21, rng), 1, 0), rng.random((48, 64))
+    u, v = Place.of_detector(64, 48).coordinates((48, 64))
+    found = FieldEngine(gaussian(21, 2.0), [term], (u, v), (48, 64), span=PERIODIC).apply(scene)
+    nine = direct(np.tile(scene, (3, 3)), gaussian(21, 2.0))
+    nine += direct(np.tile(scene * u, (3, 3)), term.kernel)
+    assert np.abs(found - nine[48:96, 64:128]).max() < 1e-6
 
 
 @settings(deadline=None, max_examples=40)
