@@ -27,18 +27,9 @@ from numpy.typing import NDArray
 
 from psfcore.arrays import Vector
 from psfcore.compiled import Later, compiled
-from psfcore.convolution.engine import (
-    Engine,
-    FieldLines,
-    Scratch,
-    Single,
-    add_weighed,
-    aligned,
-    clear_beyond,
-    copy_numbers,
-    weigh,
-)
+from psfcore.convolution.engine import Engine, Scratch, aligned
 from psfcore.convolution.fft_kernels import Plan, forward, inverse
+from psfcore.convolution.kernels import FieldLines, Single, add_weighed, clear_beyond, copy_numbers, weigh
 from psfcore.convolution.lengths import LANES
 from psfcore.convolution.offsets import needed_kernel
 from psfcore.psf_field import FieldTerm, common_shape, nine_places

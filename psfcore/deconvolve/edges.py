@@ -38,7 +38,8 @@ from typing import TypeVar, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.convolution.engine import BLOCK_ROWS, PERIODIC
+from psfcore.convolution.engine import PERIODIC
+from psfcore.convolution.kernels import BLOCK_ROWS
 from psfcore.deconvolve.declaration import WITHOUT_MARGIN, Edges
 from psfcore.errors import DataError
 from psfcore.image import Image

@@ -16,7 +16,7 @@ import numpy as np
 from astropy.io.fits import Header
 
 from psfcore.compiled import is_kept
-from psfcore.convolution import engine
+from psfcore.convolution import kernels
 from psfcore.convolution.fft_kernels import make_plan
 from psfcore.convolution.lengths import LARGEST_LENGTH, good_length
 from psfcore.deconvolve.assess.changes import measure_changes
@@ -40,7 +40,7 @@ def compiling_beside(method: str, shape: tuple[int, int]) -> Iterator[None]:
     shape
         Shape (ny, nx) of the image.
     """
-    if is_kept(engine._rows_forward) or not folder_of_kernels()[1]:
+    if is_kept(kernels.rows_forward) or not folder_of_kernels()[1]:
         yield
         return
     quiet = subprocess.DEVNULL

@@ -18,7 +18,7 @@ from typing import overload
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.convolution.engine import BLOCK_ROWS
+from psfcore.convolution.kernels import BLOCK_ROWS
 
 Lanes = NDArray[np.float32]
 _LARGEST_EXPONENT = 15  # all numbers of a scene are below 2^15; float16 ends at 65504

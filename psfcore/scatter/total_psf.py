@@ -59,7 +59,8 @@ from numpy.typing import NDArray
 
 from psfcore.arrays import Kernel, Matrix, Vector
 from psfcore.convolution.convolver import Convolver
-from psfcore.convolution.engine import BLOCK_ROWS, Engine, aligned
+from psfcore.convolution.engine import Engine, aligned
+from psfcore.convolution.kernels import BLOCK_ROWS
 from psfcore.convolution.lengths import LANES
 from psfcore.deconvolve.assess.error_planes import sigma_points
 from psfcore.deconvolve.conditions import new_engine

@@ -42,9 +42,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.compiled import compiled
-from psfcore.convolution.engine import (
+from psfcore.convolution.engine import Engine
+from psfcore.convolution.kernels import (
     BLOCK_ROWS,
-    Engine,
     Lines,
     Single,
     clear_rows_beyond,

@@ -37,7 +37,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.compiled import compiled
-from psfcore.convolution.engine import Lines, Single, rows_from_spectrum, rows_to_spectrum
+from psfcore.convolution.kernels import Lines, Single, rows_from_spectrum, rows_to_spectrum
 from psfcore.convolution.lengths import LANES
 from psfcore.deconvolve.problem import (
     Iteration,

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.compiled import compiled
-from psfcore.convolution.engine import Single
+from psfcore.convolution.kernels import Single
 from psfcore.deconvolve.iterations.richardson_lucy import LucyIteration, agreed, light_above_floor
 from psfcore.deconvolve.problem import Problem, relative_change
 

@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import Convolver, linear_convolve
-from psfcore.convolution.engine import BLOCK_ROWS, Engine, Scratch
+from psfcore.convolution.engine import Engine, Scratch
 from psfcore.convolution.fft_kernels import forward, inverse, make_plan
+from psfcore.convolution.kernels import BLOCK_ROWS
 from psfcore.convolution.lengths import LANES, good_length
 from psfcore.errors import DataError
 from tests.psfcore.conftest import delta, gaussian
