@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from psfcore.arrays import cut
 from psfcore.errors import DataError
 from psfcore.instruments.files import PLATE_SCALE_TOLERANCE as PLATE_SCALE_TOLERANCE
-from psfcore.psf_field import FieldTerm, Place, check_field, kernel_at, nine_places
+from psfcore.psf_field import FieldTerm, Place, check_field, common_shape, factors_at, nine_places
 from psfcore.recipe import REACH_GRID_PX as REACH_GRID_PX
 
 SHOWN_RADII_PX = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
@@ -135,7 +135,8 @@ class Psf:
         ndarray of float64
             The weights [y, x]; those of every place if the PSF does not change over the field.
         """
-        return kernel_at(self.kernel, self.field_terms, u, v)
+        kernels = common_shape([self.kernel, *(term.kernel for term in self.field_terms)])
+        return np.asarray(np.tensordot(factors_at(self.field_terms, [(u, v)])[0], kernels, 1))
 
 
 def _check_weights(kernel: Kernel) -> None:
@@ -307,8 +308,7 @@ def light_beyond_map(psf: Psf, radii_px: ArrayLike) -> NDArray[np.float64]:
     encircled = [
         encircled_energy(one, radii_px) for one in (psf.kernel, *(t.kernel for t in psf.field_terms))
     ]
-    factors = [[1.0, *(term.at(u, v) for term in psf.field_terms)] for u, v in nine_places()]
-    beyond = 1.0 - np.transpose(encircled) @ np.transpose(factors)
+    beyond = 1.0 - np.transpose(encircled) @ factors_at(psf.field_terms, nine_places()).T
     return np.asarray(100.0 * np.maximum(beyond, 0.0).reshape(-1, 3, 3))
 
 

@@ -16,7 +16,7 @@ and v keep their values at the edge, -1 or 1. K_m may be negative; K may not.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,10 +68,6 @@ class FieldTerm:
                 f"{self.kernel.shape}: replace weights that are NaN or infinite, for example by 0",
             )
 
-    def at(self, u: float, v: float) -> float:
-        """The factor u^a v^b."""
-        return float(u**self.x_power * v**self.y_power)
-
 
 @dataclass(frozen=True)
 class Place:
@@ -114,9 +110,8 @@ class Place:
         return np.clip(u + du * np.arange(nx), -1, 1), np.clip(v + dv * np.arange(ny), -1, 1)
 
 
-def common_shape(kernel: Kernel, terms: Sequence[FieldTerm]) -> list[Kernel]:
-    """K0 and all K_m on one array that holds each of them, with the centre at [ny // 2, nx // 2]."""
-    kernels = [kernel, *(term.kernel for term in terms)]
+def common_shape(kernels: Sequence[Kernel]) -> list[Kernel]:
+    """Kernels on arrays of one shape that holds each of them, with the centre at [ny // 2, nx // 2]."""
     ny, nx = (max(one.shape[axis] for one in kernels) for axis in (0, 1))
     return [
         one
@@ -131,12 +126,9 @@ def nine_places() -> Iterator[tuple[float, float]]:
     return ((u, v) for v in (-1.0, 0.0, 1.0) for u in (-1.0, 0.0, 1.0))
 
 
-def kernel_at(kernel: Kernel, terms: Sequence[FieldTerm], u: float, v: float) -> Kernel:
-    """K of Eq. (1) at a place."""
-    first, *others = common_shape(kernel, terms)
-    for term, other in zip(terms, others, strict=True):
-        first = first + term.at(u, v) * other
-    return first
+def factors_at(terms: Sequence[FieldTerm], places: Iterable[tuple[float, float]]) -> NDArray[np.float64]:
+    """The factors of K0 (1) and of the K_m of Eq. (1) at places (u, v): (places, 1 + terms)."""
+    return np.array([[1.0, *(u**term.x_power * v**term.y_power for term in terms)] for u, v in places])
 
 
 def check_field(
@@ -151,8 +143,8 @@ def check_field(
             "expected the size of the detector (FIELDNX, FIELDNY) beside terms FIELD; got none: give it",
         )
     places = checked_places(terms)
-    factors = np.array([[1.0, *(term.at(u, v) for term in terms)] for u, v in places])
-    planes = common_shape(kernel, terms)
+    factors = factors_at(terms, places)
+    planes = common_shape([kernel, *(term.kernel for term in terms)])
     ny, nx = planes[0].shape
     # The sum is defined over the full reach; a larger array may sum to more.
     rows, columns = (

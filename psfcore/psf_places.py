@@ -23,10 +23,10 @@ from pathlib import Path
 
 import numpy as np
 
-from psfcore.arrays import Kernel, Matrix, cut
+from psfcore.arrays import Matrix
 from psfcore.errors import DataError
 from psfcore.psf import PLATE_SCALE_TOLERANCE, Psf
-from psfcore.psf_field import MOST_POWERS, FieldTerm, Place, checked_places
+from psfcore.psf_field import MOST_POWERS, FieldTerm, Place, checked_places, common_shape, factors_at
 
 # A power adds nothing if the places determine it to less than this share of its size.
 _DETERMINED = 1e-3
@@ -92,8 +92,7 @@ def fit_places(given: Sequence[PlacedPsf], detector: tuple[int, int], *, order: 
     wanted = [(total - b, b) for total in range(1, order + 1) for b in range(total + 1)]
     powers = _determined(places, wanted)
     factors = np.array([[1.0, *(u**a * v**b for a, b in powers)] for u, v in places])
-    shape = tuple(max(one.psf.kernel.shape[axis] for one in given) for axis in (0, 1))
-    kernels = np.array([_placed(one.psf.kernel, (shape[0], shape[1])) for one in given])
+    kernels = np.array(common_shape([one.psf.kernel for one in given]))
     planes = np.tensordot(np.linalg.pinv(factors), kernels, 1)  # Eq. (1)
     clipped = raise_to_zero(planes, powers)
     found = np.tensordot(factors, planes, 1)
@@ -170,10 +169,6 @@ def _determined(places: Matrix, wanted: Sequence[Powers]) -> list[Powers]:
     return powers
 
 
-def _placed(kernel: Kernel, shape: tuple[int, int]) -> Kernel:
-    return cut(kernel, kernel.shape[0] // 2 - shape[0] // 2, kernel.shape[1] // 2 - shape[1] // 2, shape)
-
-
 def raise_to_zero(planes: Matrix, powers: Sequence[Powers]) -> float:
     """Change the planes K0 and K_m so that no weight is below 0 on the detector; returns the share of the light that
     was below 0 at the worst place.
@@ -181,19 +176,19 @@ def raise_to_zero(planes: Matrix, powers: Sequence[Powers]) -> float:
     Raises DataError "places-too-close" if the central weights would be below 0.
     """
     terms = [FieldTerm(plane, a, b) for plane, (a, b) in zip(planes[1:], powers, strict=True)]
-    factors = [[term.at(u, v) for term in terms] for u, v in checked_places(terms)]
+    factors = factors_at(terms, checked_places(terms))
     centre = (planes.shape[1] // 2, planes.shape[2] // 2)
     sums = planes.sum(axis=(1, 2))
     lowest, below = planes[0].copy(), 0.0
     for of_place in factors:
-        kernel = planes[0] + np.tensordot(of_place, planes[1:], 1)
+        kernel = np.tensordot(of_place, planes, 1)
         below = max(below, -float(np.minimum(kernel, 0).sum()))
         np.minimum(lowest, kernel, out=lowest)
     np.maximum(planes[0], 0, out=planes[0])
     lifted = lowest < 0
     planes[1:, lifted] *= planes[0, lifted] / (planes[0, lifted] - lowest[lifted])
     planes[:, centre[0], centre[1]] += sums - planes.sum(axis=(1, 2))
-    if min(planes[0][centre] + np.dot(of_place, planes[1:, *centre]) for of_place in factors) < 0:
+    if (factors @ planes[:, *centre]).min() < 0:
         raise DataError(
             "places-too-close",
             "expected PSFs at places from which the PSF at the corners of the detector can be extrapolated; got "

@@ -42,6 +42,8 @@ from psfcore.fits.channel import PsfOrigin, binning_factor
 from psfcore.fits.frame import SILENT_DEG, UNIT, Matrix, frame_of, plate_scale_arcsec
 from psfcore.fits.place import place_of
 from psfcore.image import Image
+from psfcore.instruments.files import instrument_names
+from psfcore.instruments.model import load_instrument
 from psfcore.psf import LARGEST_SUM, PLATE_SCALE_TOLERANCE, REACH_GRID_PX, Psf, crop_centred, with_kernels
 from psfcore.psf_field import FieldTerm, Place
 
@@ -95,7 +97,9 @@ def sampling_of(psf: Psf, header: Cards, shape: tuple[int, int] | None = None) -
     factor = binning_factor(psf, header)
     place = None
     if psf.place is not None:
-        place = place_of(header, shape, psf.place.detector, factor, turn)
+        known = psf.instrument in instrument_names()
+        readout_px = load_instrument(str(psf.instrument)).detector.pixels if known else None
+        place = place_of(header, shape, psf.place.detector, factor, turn, readout_px)
         place = None if place == psf.place else place
     return Sampling(factor, turn or UNIT, place)
 

@@ -81,6 +81,7 @@ class Engine:
     """
 
     _buffers = 1  # of a thread
+    _spectra: tuple[int, ...] = ()  # first axis of the spectrum, for an engine with several spectra
 
     def __init__(
         self,
@@ -130,11 +131,7 @@ class Engine:
     @cached_property
     def _spectrum(self) -> Single:
         """The spectrum of the field, in blocks of columns. It must be asked for before threads share it."""
-        return aligned(*self._shape_of_spectrum)
-
-    @property
-    def _shape_of_spectrum(self) -> tuple[int, ...]:
-        return self.column_blocks, self.row_blocks * BLOCK_ROWS, 2, LANES
+        return aligned(*self._spectra, self.column_blocks, self.row_blocks * BLOCK_ROWS, 2, LANES)
 
     @cached_property
     def _whole(self) -> Single:

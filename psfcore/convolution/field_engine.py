@@ -19,8 +19,7 @@ direction. One linear term costs one and a half times as many transforms as a PS
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +31,7 @@ from psfcore.convolution.fft_kernels import Plan, forward, inverse
 from psfcore.convolution.kernels import FieldLines, Single, add_weighed, clear_beyond, copy_numbers, weigh
 from psfcore.convolution.lengths import LANES
 from psfcore.convolution.offsets import needed_kernel
-from psfcore.psf_field import FieldTerm, common_shape, nine_places
+from psfcore.psf_field import FieldTerm, common_shape, factors_at, nine_places
 
 if TYPE_CHECKING:
     from psfcore.convolution import lanes as instructions
@@ -40,27 +39,6 @@ else:
     instructions = Later("psfcore.convolution.lanes")
 
 _SIZE = 2 * LANES
-
-
-class _Terms(NamedTuple):
-    """K0 and the terms, for the kernels of the columns.
-
-    Attributes
-    ----------
-    transfers
-        Transfer functions, [term] and then as `Engine.transfer`.
-    source
-        The number of the spectrum of each term, 0 for that of the field.
-    factors
-        The factors v^b [term][row].
-    opens
-        Whether a term is the first one of its spectrum.
-    """
-
-    transfers: Single
-    source: NDArray[np.int64]
-    factors: Single
-    opens: NDArray[np.bool_]
 
 
 class FieldEngine(Engine):
@@ -90,7 +68,7 @@ class FieldEngine(Engine):
         span: tuple[int, int] | None = None,
         threads: int = 1,
     ) -> None:
-        kernels = common_shape(np.asarray(psf_kernel, np.float64), terms)
+        kernels = common_shape([np.asarray(psf_kernel, np.float64), *(term.kernel for term in terms)])
         super().__init__(kernels[0], field_shape, span=span, threads=threads)
         others = [self._transfer_function(*needed_kernel(one, self._joined)) for one in kernels[1:]]
         parts = max(one.shape[2] for one in (self.transfer, *others))
@@ -104,13 +82,10 @@ class FieldEngine(Engine):
         self._factors = np.array([u**power for power in powers], np.float32).reshape(len(powers), u.size)
         self._source = np.array([0, *([0, *powers].index(term.x_power) for term in terms)])
         self._along_y = np.zeros((len(kernels), self.row_blocks * 2 * LANES), np.float32)
-        self._to_rows = 0
+        # Whether a term is the first one of its spectrum.
+        self._opens = np.isin(np.arange(len(kernels)), np.unique(self._source, return_index=True)[1])
+        self._to_rows, self._spectra = 0, (1 + len(powers),)
         self._along_y[:, : v.size] = [v**power for power in (0, *(term.y_power for term in terms))]
-
-    @cached_property
-    def _spectrum(self) -> Single:
-        """The spectrum of the field, and those of the field times each u^a."""
-        return aligned(1 + len(self._factors), *self._shape_of_spectrum)
 
     @property
     def nbytes(self) -> int:
@@ -119,17 +94,14 @@ class FieldEngine(Engine):
 
     def local_transfers(self, rows: int) -> Iterator[Single]:
         """The first rows of the transfer functions at nine places of the detector."""
-        for u, v in nine_places():
-            factors = [1.0, *(term.at(u, v) for term in self._of_terms)]
-            yield np.tensordot(np.array(factors, np.float32), self._transfers[:, :, :rows], 1)
+        for factors in factors_at(self._of_terms, nine_places()):
+            yield np.tensordot(factors.astype(np.float32), self._transfers[:, :, :rows], 1)
 
     def columns(self, *, adjoint: bool) -> None:
         """The columns of Eq. (1) or Eq. (2): transform them, multiply by the transfer functions, and transform back."""
-        opens = np.zeros(self._source.size, np.bool_)
-        opens[np.unique(self._source, return_index=True)[1]] = True
-        terms = _Terms(self._transfers, self._source, self._along_y, opens)
         kernel = _columns_adjoint if adjoint else _columns_forward
-        self._stage(kernel, self.column_plan, self.column_blocks, terms)
+        terms = (self._transfers, self._source, self._along_y, self._opens)
+        self._stage(kernel, self.column_plan, self.column_blocks, *terms)
         self._to_rows = len(self._factors) if adjoint else 0
 
     def multiply_columns(self, transfer: Single, *, conjugate: bool = False) -> None:
@@ -163,19 +135,38 @@ class FieldEngine(Engine):
 
 
 @compiled()
-def _columns_forward(lines: FieldLines, start: int, stop: int, terms: _Terms) -> None:
-    """The columns of Eq. (1). The result is in the spectrum of the field."""
+def _columns_forward(
+    lines: FieldLines,
+    start: int,
+    stop: int,
+    transfers: Single,
+    source: NDArray[np.int64],
+    factors: Single,
+    opens: NDArray[np.bool_],
+) -> None:
+    """The columns of Eq. (1). The result is in the spectrum of the field.
+
+    Parameters
+    ----------
+    transfers
+        Transfer functions, [term] and then as `Engine.transfer`.
+    source
+        The number of the spectrum of each term, 0 for that of the field.
+    factors
+        The factors v^b [term][row].
+    opens
+        Whether a term is the first one of its spectrum.
+    """
     buffer, total, length = lines.buffer, lines.second, lines.plan.length
     rows = min(lines.spectrum.shape[1], length)
     for group in range(start, stop):
         clear_beyond(total, 0, length)
-        for m in range(terms.source.size):
-            source = terms.source[m]
-            spectrum = lines.spectra[source - 1] if source > 0 else lines.spectrum
-            weigh(spectrum[group].reshape(-1), terms.factors[m], buffer, rows)
+        for m in range(source.size):
+            spectrum = lines.spectra[source[m] - 1] if source[m] > 0 else lines.spectrum
+            weigh(spectrum[group].reshape(-1), factors[m], buffer, rows)
             clear_beyond(buffer, rows * _SIZE, length)
             forward(buffer, lines.plan)
-            transfer = terms.transfers[m]
+            transfer = transfers[m]
             for k in range(length):
                 if transfer.shape[2] == 1:
                     instructions.add_scaled(buffer, transfer, total, k * _SIZE, (group * length + k) * LANES)
@@ -186,27 +177,46 @@ def _columns_forward(lines: FieldLines, start: int, stop: int, terms: _Terms) ->
 
 
 @compiled()
-def _columns_adjoint(lines: FieldLines, start: int, stop: int, terms: _Terms) -> None:
-    """The columns of Eq. (2), from the spectrum of the field. The results are in all spectra."""
+def _columns_adjoint(
+    lines: FieldLines,
+    start: int,
+    stop: int,
+    transfers: Single,
+    source: NDArray[np.int64],
+    factors: Single,
+    opens: NDArray[np.bool_],
+) -> None:
+    """The columns of Eq. (2), from the spectrum of the field. The results are in all spectra.
+
+    Parameters
+    ----------
+    transfers
+        Transfer functions, [term] and then as `Engine.transfer`.
+    source
+        The number of the spectrum of each term, 0 for that of the field.
+    factors
+        The factors v^b [term][row].
+    opens
+        Whether a term is the first one of its spectrum.
+    """
     once, buffer, length = lines.second, lines.buffer, lines.plan.length
     rows = min(lines.spectrum.shape[1], length)
     for group in range(start, stop):
         copy_numbers(lines.spectrum[group].reshape(-1), once, rows * _SIZE)
         clear_beyond(once, rows * _SIZE, length)
         forward(once, lines.plan)
-        for m in range(terms.source.size):
+        for m in range(source.size):
             copy_numbers(once, buffer, length * _SIZE)
-            transfer = terms.transfers[m]
+            transfer = transfers[m]
             for k in range(length):
                 if transfer.shape[2] == 1:
                     instructions.scale(buffer, transfer, k * _SIZE, (group * length + k) * LANES)
                 else:
                     instructions.turn_back(buffer, transfer, k * _SIZE, (group * length + k) * _SIZE)
             inverse(buffer, lines.plan)
-            source = terms.source[m]
-            spectrum = lines.spectra[source - 1] if source > 0 else lines.spectrum
+            spectrum = lines.spectra[source[m] - 1] if source[m] > 0 else lines.spectrum
             column = spectrum[group].reshape(-1)
-            if terms.opens[m]:
-                weigh(buffer, terms.factors[m], column, rows)
+            if opens[m]:
+                weigh(buffer, factors[m], column, rows)
             else:
-                add_weighed(buffer, terms.factors[m], column, rows)
+                add_weighed(buffer, factors[m], column, rows)

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.convolution.engine import Engine
-from psfcore.convolution.field_engine import FieldEngine
 from psfcore.deconvolve.box import Box
 from psfcore.deconvolve.declaration import Edges
 from psfcore.errors import DataError
@@ -33,6 +32,8 @@ def new_engine(psf: Psf, shape: Shape, span: Shape, threads: int, margin_px: int
     terms = [term for term in psf.field_terms if term.kernel.any()]
     if not terms:
         return Engine(psf.kernel, shape, span=span, threads=threads)
+    from psfcore.convolution.field_engine import FieldEngine  # few PSFs change over the field
+
     assert psf.place is not None
     coordinates = psf.place.from_pixel(-margin_px, -margin_px).coordinates(shape)
     return FieldEngine(psf.kernel, terms, coordinates, shape, span=span, threads=threads)

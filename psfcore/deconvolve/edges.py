@@ -44,7 +44,7 @@ from psfcore.deconvolve.declaration import WITHOUT_MARGIN, Edges
 from psfcore.errors import DataError
 from psfcore.image import Image
 from psfcore.psf import Psf
-from psfcore.psf_field import common_shape, nine_places
+from psfcore.psf_field import common_shape, factors_at, nine_places
 
 EDGES: tuple[Edges, ...] = get_args(Edges)
 
@@ -138,11 +138,11 @@ def share_from_beyond(psf: Psf) -> NDArray[np.float64]:
     """Compute b of Eq. (1) for d = 0, 1, ... px, up to half the size of the PSF. If the PSF changes over the field, it
     is the largest b of nine places.
     """
-    kernels = common_shape(psf.kernel, psf.field_terms)
+    kernels = common_shape([psf.kernel, *(term.kernel for term in psf.field_terms)])
     along_y, along_x = (np.array([one.sum(axis=axis) for one in kernels]) for axis in (1, 0))
-    places = list(nine_places()) if psf.field_terms else [(0.0, 0.0)]
-    factors = [np.array([1.0, *(term.at(u, v) for term in psf.field_terms)]) for u, v in places]
-    return np.asarray(np.max([_share(of @ along_y, of @ along_x) for of in factors], axis=0))
+    places = nine_places() if psf.field_terms else [(0.0, 0.0)]
+    shares = [_share(of @ along_y, of @ along_x) for of in factors_at(psf.field_terms, places)]
+    return np.asarray(np.max(shares, axis=0))
 
 
 def _share(along_y: NDArray[np.float64], along_x: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -25,7 +25,12 @@ _WHOLE_PX = 0.02
 
 
 def place_of(
-    header: Cards, shape: tuple[int, int] | None, detector: tuple[int, int], factor: int, turn: Matrix | None
+    header: Cards,
+    shape: tuple[int, int] | None,
+    detector: tuple[int, int],
+    factor: int,
+    turn: Matrix | None,
+    readout_px: int | None = None,
 ) -> Place:
     """The place of an image on a detector. Raises DataError "psf-place", which says what the header does not tell.
 
@@ -39,6 +44,9 @@ def place_of(
         Pixels of the detector in a pixel of the image, along each axis.
     turn
         The matrix T of `psfcore.fits.frame` with the values -1, 0 and 1; None: the image was turned by another angle.
+    readout_px
+        Size of the whole detector in px, in whose pixels the cards of a part count; None: unknown. The PSF may have
+        been made for a part of it.
     """
     if turn is None:
         raise _unknown("an image that was turned by quarter turns at most", "use the image before the turn")
@@ -49,7 +57,7 @@ def place_of(
     along = []
     for axis, count in enumerate((int(nx), int(ny))):
         on_detector = 0 if turn[0][axis] else 1
-        first = _first_pixel(header, on_detector, count, detector[on_detector], factor)
+        first = _first_pixel(header, on_detector, count, detector[on_detector], factor, readout_px)
         first_px = first + (factor - 1) / 2
         last_px = first_px + (count - 1) * factor
         step = 2 / (detector[on_detector] - 1)
@@ -61,7 +69,9 @@ def place_of(
     return Place(along[0], along[1])
 
 
-def _first_pixel(header: Cards, axis: int, count: int, size: int, factor: int) -> float:
+def _first_pixel(
+    header: Cards, axis: int, count: int, size: int, factor: int, readout_px: int | None
+) -> float:
     """The first pixel of the detector, from 0, that an image shows along an axis (0: x) of the detector.
 
     Parameters
@@ -73,6 +83,11 @@ def _first_pixel(header: Cards, axis: int, count: int, size: int, factor: int) -
     """
     if count == size // factor:
         return 0.0
+    if readout_px not in (None, size):
+        raise _unknown(
+            f"the part of {size} px for which the PSF was made, of {readout_px} px of the detector along {'xy'[axis]}",
+            f"use an image of all {size} px",
+        )
     of_xrt = (optional_text(header, "INSTRUME") or "").upper() == "XRT"
     keys, counted_from = (_WINDOW_OF_XRT[axis], 0) if of_xrt else (_WINDOW[axis], 1)
     begin, end = (optional_number(header, key) for key in keys)

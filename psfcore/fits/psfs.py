@@ -76,7 +76,8 @@ def _field_hdus(psf: Psf) -> list[fits.ImageHDU]:
     for term in psf.field_terms:
         assert psf.place is not None
         (nx, ny), (u, v) = psf.place.detector, (-psf.place.x[0], -psf.place.y[0])
-        hdu = fits.ImageHDU((term.at(u, v) * term.kernel).astype(np.float32), name=FIELD)
+        factor = u**term.x_power * v**term.y_power
+        hdu = fits.ImageHDU((factor * term.kernel).astype(np.float32), name=FIELD)
         for axis, power, size in (("X", term.x_power, nx), ("Y", term.y_power, ny)):
             hdu.header[f"{axis}POWER"] = (power, f"power of the {axis.lower()} coordinate, -1 to 1")
             hdu.header[f"FIELDN{axis}"] = (size, "[pixel] size of the detector")

@@ -88,15 +88,14 @@ def _values(corrected: Corrected) -> Vector:
 
 
 def _theta(corrected: Corrected, values: Vector) -> dict[str, float]:
-    """The parameters x, y and outwards of the effect, from the values of all parameters of a refit."""
-    of_label = dict(zip(corrected.values, values.tolist(), strict=True))
-    names = corrected.parameters(FIELD_DEPENDENT) if _has_field(corrected) else {}
-    alone = len(corrected.effects) == 1
-    return {name: of_label[name if alone else f"{FIELD_DEPENDENT}.{name}"] for name in names}
-
-
-def _has_field(corrected: Corrected) -> bool:
-    return any(effect.name == FIELD_DEPENDENT for effect in corrected.effects)
+    """The parameters x, y and outwards of the effect, from the values of all parameters of a refit; none if the refit
+    is without the effect.
+    """
+    if all(effect.name != FIELD_DEPENDENT for effect in corrected.effects):
+        return {}
+    rows = zip(corrected.values.items(), values.tolist(), strict=True)
+    moved = replace(corrected, values={label: (value, *rest) for (label, (_, *rest)), value in rows})
+    return {name: value for name, (value, _) in moved.parameters(FIELD_DEPENDENT).items()}
 
 
 def _amount_slope(total: TotalPsf, at: Vector) -> Kernel:

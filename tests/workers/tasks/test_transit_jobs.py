@@ -132,6 +132,22 @@ def test_the_curve_is_that_of_the_truth_within_its_errors(fitted: dict[str, Any]
     assert np.abs(found - truth)[radii <= 50].max() < 2
 
 
+def test_a_fit_with_terms_of_the_field_has_errors_and_a_test(
+    service: InProcess, transit: Path, fitted: dict[str, Any], inversions: list[int], tmp_path: Path
+) -> None:
+    """The scatter of this transit is constant."""
+    row = service.fit_psf(transit, tmp_path / "psf.fits", report=tmp_path / "psf.json", field=1)
+    told, report = row["details"]["fit"]["field"], json.loads((tmp_path / "psf.json").read_text())
+    assert row["id"] != fitted["psf"]["id"] and report["field"] == told
+    assert set(told["parameters"]) == {"x", "y"} and 0 < told["p_value"] <= 1
+    pulls = [one["value"] / one["sigma"] for one in told["parameters"].values()]
+    assert max(map(abs, pulls)) < 4, "there is no change"
+    psf = read_psf(tmp_path / "psf.fits", LIMITS)
+    assert [(term.x_power, term.y_power) for term in psf.field_terms] == [(1, 0), (0, 1)]
+    assert psf.place is not None and psf.place.detector == (128, 128)
+    assert row["details"]["field"]["detector_px"] == [128, 128]
+
+
 def test_the_product_says_what_it_was_made_of(fitted: dict[str, Any]) -> None:
     psf, report = fitted["psf"], fitted["report"]
     assert psf["origin"] == "fitted" and psf["report"] == f"/v1/psfs/{psf['id']}/report"
