@@ -17,7 +17,7 @@ import pytest
 from astropy.io import fits
 from threadpoolctl import threadpool_limits
 
-from psfcore.gap.view import return_unused_memory
+from psfcore.memory import return_unused_memory
 
 REPOSITORY = Path(__file__).parents[1]
 pytest_plugins = ("tests.chromium", "tests.shared_stack")

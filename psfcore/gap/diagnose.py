@@ -47,7 +47,8 @@ from psfcore.gap.verdict.closure import (
 )
 from psfcore.gap.verdict.correction import Corrected, add_to_model
 from psfcore.gap.verdict.limits import Limits, limits
-from psfcore.gap.view import View, return_unused_memory
+from psfcore.gap.view import View
+from psfcore.memory import return_unused_memory
 from psfcore.psf import Psf
 from psfcore.scatter.inversion import Inverter, solution_of
 from psfcore.scatter.reconstruction import Progress, Solution, labelled

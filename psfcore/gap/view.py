@@ -6,8 +6,6 @@ would fit this noise.
 
 from __future__ import annotations
 
-import ctypes
-import gc
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
@@ -223,16 +221,3 @@ class View:
         if weight is not None:
             scene = scene * slope.lanes(weight)
         return slope.field(slope.convolve(scene))
-
-
-def return_unused_memory() -> None:
-    """Free objects without references, and return the unused heap to the system, where the C library can do this
-    (glibc).
-
-    A view and its fields refer to each other, so only the garbage collector frees them. The C library then keeps freed
-    blocks of up to 32 MiB for later use: after each full refit of 30 images of 512 px, 0.3 to 0.6 GiB.
-    """
-    gc.collect()
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:
-        trim(0)

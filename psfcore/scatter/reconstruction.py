@@ -15,6 +15,7 @@ from typing import Self, TypeVar
 import numpy as np
 
 from psfcore.arrays import Kernel, Matrix, Vector
+from psfcore.memory import return_unused_heap
 from psfcore.scatter.scenes import Scenes
 from psfcore.scatter.shapes import Shape
 from psfcore.scatter.total_psf import Blur, Lanes, Optics, Pixels, TotalPsf, put
@@ -73,6 +74,8 @@ def on_threads(
         return results
     finally:
         pool.shutdown(cancel_futures=True)
+        if len(tools) > 1:
+            return_unused_heap()  # of the threads that ended
 
 
 @dataclass(eq=False)

@@ -23,7 +23,8 @@ from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.effect_fits import EffectFit, fit_effects, label_of, left_chi2
 from psfcore.gap.evidence.linear_model import LinearModel
 from psfcore.gap.evidence.responses import Evidence, gather, residuals_at
-from psfcore.gap.view import View, return_unused_memory
+from psfcore.gap.view import View
+from psfcore.memory import return_unused_memory
 from psfcore.scatter.inversion import invert, solution_at
 from psfcore.scatter.reconstruction import Progress, Solution
 from psfcore.transit.transit import Transit

@@ -9,7 +9,8 @@ import numpy as np
 import psutil
 import pytest
 
-from psfcore.gap.view import View, return_unused_memory
+from psfcore.gap.view import View
+from psfcore.memory import return_unused_memory
 from tests.psfcore.gap.small_gaps import changed, clean, fit, solution
 
 MIB = 2**20
