@@ -160,15 +160,19 @@ def _columns_forward(
     buffer, total, length = lines.buffer, lines.second, lines.plan.length
     rows = min(lines.spectrum.shape[1], length)
     for group in range(start, stop):
-        clear_beyond(total, 0, length)
         for m in range(source.size):
             spectrum = lines.spectra[source[m] - 1] if source[m] > 0 else lines.spectrum
-            weigh(spectrum[group].reshape(-1), factors[m], buffer, rows)
-            clear_beyond(buffer, rows * _SIZE, length)
-            forward(buffer, lines.plan)
+            column = buffer if m > 0 else total
+            weigh(spectrum[group].reshape(-1), factors[m], column, rows)
+            clear_beyond(column, rows * _SIZE, length)
+            forward(column, lines.plan)
             transfer = transfers[m]
             for k in range(length):
-                if transfer.shape[2] == 1:
+                if m == 0 and transfer.shape[2] == 1:
+                    instructions.scale(total, transfer, k * _SIZE, (group * length + k) * LANES)
+                elif m == 0:
+                    instructions.turn(total, transfer, k * _SIZE, (group * length + k) * _SIZE)
+                elif transfer.shape[2] == 1:
                     instructions.add_scaled(buffer, transfer, total, k * _SIZE, (group * length + k) * LANES)
                 else:
                     instructions.add_turned(buffer, transfer, total, k * _SIZE, (group * length + k) * _SIZE)
@@ -199,14 +203,16 @@ def _columns_adjoint(
     opens
         Whether a term is the first one of its spectrum.
     """
-    once, buffer, length = lines.second, lines.buffer, lines.plan.length
+    once, length, last = lines.second, lines.plan.length, source.size - 1
     rows = min(lines.spectrum.shape[1], length)
     for group in range(start, stop):
         copy_numbers(lines.spectrum[group].reshape(-1), once, rows * _SIZE)
         clear_beyond(once, rows * _SIZE, length)
         forward(once, lines.plan)
         for m in range(source.size):
-            copy_numbers(once, buffer, length * _SIZE)
+            buffer = lines.buffer if m < last else once  # the last term needs no copy
+            if m < last:
+                copy_numbers(once, buffer, length * _SIZE)
             transfer = transfers[m]
             for k in range(length):
                 if transfer.shape[2] == 1:
