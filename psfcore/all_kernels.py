@@ -17,6 +17,7 @@ from functools import partial
 import numpy as np
 
 from psfcore.build import build_psf
+from psfcore.convolution.engine import Engine
 from psfcore.convolution.fft_kernels import make_plan
 from psfcore.deconvolve.kernels import compile_kernels
 from psfcore.deconvolve.methods.registry import method_names
@@ -39,6 +40,7 @@ def works() -> dict[str, Callable[[], object]]:
         **{name: partial(compile_kernels, name, SHAPE) for name in method_names()},
         **{f"PSF of {name}": partial(_build, name) for name in of_telescope.values()},
         "other masks and meshes": _diffract,
+        "PSFs that change over the field": _change_over_field,
         "transforms": _transform,
         "scatter": _scatter,
     }
@@ -84,12 +86,23 @@ def _diffract() -> None:
     hexagonal_mesh_kernel(4.0, pitch_um=400.0, wire_um=40.0, windows=9, angle_deg=10.0, size=32)
 
 
+def _change_over_field() -> None:
+    for name in method_names():
+        compile_kernels(name, SHAPE, changing=True)
+
+
 def _transform() -> None:
     for length in (16, 32, 48, 64, 80):  # 2 x 8, 4 x 8, 3 x 2 x 8, 8 x 8, 5 x 2 x 8
         make_plan(length)
 
 
 def _scatter() -> None:
+    """What a fit of scatter needs beside a deconvolution."""
+    engine = Engine(np.full((3, 3), 1 / 9), (32, 32))
+    engine.rows_forward(engine.to_lanes(np.ones((32, 32))))
+    engine.rows_cut()
+    engine.transform_columns()
+    engine.multiply_kept(engine.transfer)
     segments = Segments((1.0, 3.0, 6.0), reach_grid_px=16)
     for kind in (np.float32, np.float64):
         segment_sums(np.ones((16, 16), kind), np.array([[4, 4], [8, 9]]), segments)

@@ -25,6 +25,7 @@ from psfcore.deconvolve.methods.registry import method_named
 from psfcore.image import Image
 from psfcore.kernel_files import folder_of_kernels
 from psfcore.psf import REACH_GRID_PX, Psf
+from psfcore.psf_field import FieldTerm, Place
 
 SIZE_PX = 32
 
@@ -55,15 +56,31 @@ def compiling_beside(method: str, shape: tuple[int, int]) -> Iterator[None]:
             process.wait()
 
 
-def compile_kernels(method: str, shape: tuple[int, int]) -> None:
+def compile_kernels(method: str, shape: tuple[int, int], *, changing: bool = False) -> None:
     """Compile the kernels that a method needs for an image of this shape, if they are not kept on disk.
 
     The margin of the image, and so the length of its transforms, depends on the PSF, which does not exist yet. The
     usual length is taken; if another one is needed, at most two passes are compiled later.
+
+    Parameters
+    ----------
+    changing
+        Whether the PSF changes over the field, which needs further kernels.
     """
     weights = np.ones((SIZE_PX, SIZE_PX))
     weights[SIZE_PX // 2, SIZE_PX // 2] = SIZE_PX**2
-    psf = Psf(kernel=weights / weights.sum(), name="small", version="0", instrument=None, status="user")
+    weights /= weights.sum()
+    term = np.zeros_like(weights)
+    term[0, 0], term[-1, -1] = weights[0, 0] / 2, -weights[0, 0] / 2
+    psf = Psf(
+        kernel=weights,
+        name="small",
+        version="0",
+        instrument=None,
+        status="user",
+        field_terms=(FieldTerm(term, 1, 0),) if changing else (),
+        place=Place.of_detector(SIZE_PX, SIZE_PX) if changing else None,
+    )
     pixels = np.full((SIZE_PX, SIZE_PX), 100.0)
     image = Image(pixels, np.zeros(pixels.shape, np.uint8), Header(), "DN/s", 1.0)
     measure_changes(image, method_named(method)(image, psf, Conditions(), steps=2).pixels, psf)

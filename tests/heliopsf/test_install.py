@@ -156,8 +156,9 @@ def test_the_wheel_holds_the_packages_and_their_files_and_stays_small(wheel: Pat
         assert name in names
     kept = {f"{path.relative_to(REPOSITORY)}" for path in (REPOSITORY / "service" / "pages").rglob("*.html")}
     assert kept and kept <= names
-    # The wheel is code and texts; only a second wheel for the service would bring it below 1 MB.
-    assert wheel.stat().st_size < 1.6e6
+    # The wheel is code and texts; only a second wheel for the service would bring it below 1 MB. PSFs that change over
+    # the field and kernels without numba brought it above 1.6 MB.
+    assert wheel.stat().st_size < 1.7e6
 
 
 SCRIPT = """
