@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import gc
 import time
 from importlib import import_module
@@ -15,4 +16,6 @@ NEW_OBJECTS = 50_000
 def main() -> None:
     """Run the command."""
     gc.set_threshold(NEW_OBJECTS)
+    # At its end, Python would search all objects for garbage, although their memory is given back with the process.
+    atexit.register(gc.freeze)
     import_module("service.cli.main").main()

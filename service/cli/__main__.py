@@ -1,5 +1,5 @@
 """``python -m service.cli``: the ``heliopsf`` command."""
 
-from service.cli.main import main
+from service.start import main
 
 main()
