@@ -40,6 +40,7 @@ BLOCKS_PX = (1, 4, 8, 16, 32)  # powers of 2
 TAILS_PCT = (5.0, 1.0, 0.1)
 CHANGE_PERCENTILES = (0.1, 1.0, 5.0, 25.0, 50.0, 75.0, 95.0, 99.0, 99.9)
 _LARGEST_PCT = 99.0
+_AT_ONCE = 1 << 18
 
 Plane = NDArray[np.floating]
 Means = NDArray[np.float32]
@@ -279,20 +280,31 @@ class _Blocks:
 
     @cached_property
     def in_tails(self) -> tuple[Means, Means]:
-        """The means of the blocks of the largest tails, before and after deconvolution."""
+        """The means of the blocks of the largest tails, before and after deconvolution. On a plateau, these are all
+        blocks.
+        """
         low, high = self.old_levels[max(self.tails)]
 
-        def share(numbers: range) -> list[tuple[int, Means, Means]]:
-            found = []
-            for n in numbers:
-                old = self.old.read(n)
-                tails = (old <= low) | (old >= high)
-                found.append((n, old[tails], self.new.read(n)[tails]))
-            return found
+        def tails(n: int) -> tuple[Means, Flags]:
+            old = self.old.read(n)
+            return old, (old <= low) | (old >= high)
 
-        parts = [part for one in shared_out(share, len(self.old.sizes), self.old.threads) for part in one]
-        _, old, new = zip(*sorted(parts, key=lambda part: part[0]), strict=True)
-        return np.concatenate(old), np.concatenate(new)
+        def count(share: range) -> list[tuple[int, int]]:
+            return [(n, int(np.count_nonzero(tails(n)[1]))) for n in share]
+
+        portions, threads = len(self.old.sizes), self.old.threads
+        counts = [pair for share in shared_out(count, portions, threads) for pair in share]
+        ends = np.cumsum([of_portion for _, of_portion in sorted(counts)])
+        before, after = np.empty((2, ends[-1]), np.float32)
+
+        def fill(share: range) -> None:
+            for n in share:
+                old, chosen = tails(n)
+                here = slice(ends[n] - np.count_nonzero(chosen), ends[n])
+                before[here], after[here] = old[chosen], self.new.read(n)[chosen]
+
+        shared_out(fill, portions, threads)
+        return before, after
 
 
 def _pixels(pair: Compared) -> _Blocks:
@@ -377,21 +389,24 @@ def _structure(blocks: _Blocks, old: Means, new: Means, kind: str, tail: float) 
     chosen = (old >= level if bright else old <= level) & (old > 0)
     if not chosen.any():
         return None
-    # On a plateau, the chosen blocks may be all blocks, so few arrays are in memory at a time.
-    before = old[chosen]
-    exact = before.astype(np.float64)
-    light_before, mean = exact.sum(keepdims=True), float(exact.mean())
-    del exact
-    change = new[chosen].astype(np.float64)
-    light_after = change.sum(keepdims=True)
-    _change_pct(before, change, out=change)
+    if not chosen.all():
+        old, new = old[chosen], new[chosen]
+    change = np.empty_like(old)
+    light = np.zeros(2)
+    for first in range(
+        0, old.size, _AT_ONCE
+    ):  # all blocks of a plateau in double precision would be too large
+        part = slice(first, first + _AT_ONCE)
+        before, after = old[part].astype(np.float64), new[part].astype(np.float64)
+        light += before.sum(), after.sum()
+        change[part] = _change_pct(before, after)
     return Structure(
         kind=kind,
         block_px=blocks.block_px,
         tail_pct=tail,
-        blocks=before.size,
-        before=mean,
-        sum_pct=_change_pct(light_before, light_after).item(),
+        blocks=old.size,
+        before=float(light[0]) / old.size,
+        sum_pct=float(100 * (light[1] / light[0] - 1)),
         median_pct=float(np.median(change, overwrite_input=True)),
         up_to_pct=float(
             np.percentile(change, _LARGEST_PCT if bright else 100 - _LARGEST_PCT, overwrite_input=True)
@@ -449,9 +464,9 @@ def _percentiles(pair: Compared, of: Callable[[slice], Plane]) -> dict[str, floa
     return {f"p{level:g}": float(value) for level, value in zip(CHANGE_PERCENTILES, levels, strict=True)}
 
 
-def _change_pct(before: Plane | Means, after: Plane, *, out: Plane | None = None) -> Plane:
-    """The change in percent, Eq. (1); `out` is the array that takes the result, for example `after`."""
-    change = np.divide(after, before, out=out)
+def _change_pct(before: Plane, after: Plane) -> Plane:
+    """The change in percent, Eq. (1)."""
+    change = after / before
     change -= 1
     change *= 100
     return change
