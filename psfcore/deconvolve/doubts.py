@@ -97,7 +97,7 @@ def _across_warning(psf: Psf, image: Image) -> dict[str, str]:
     share_pct = 100 * light_across(image, psf) / mean
     return {
         "periodic": "the edges periodic bring light from each edge to the opposite one: a pixel gets at most "
-        f"{share_pct:.2g} % of the mean of the image: use the edges symmetric if this matters"
+        f"{share_pct:.3g} % of the mean of the image: use the edges symmetric if this matters"
     }
 
 
