@@ -39,7 +39,7 @@ Commands with `--local` and the Python functions keep built PSFs in a cache, whi
 | variable | meaning |
 |---|---|
 | `HELIOPSF_CACHE_DIR` | Folder of the cache; default: the user's cache folder, on Linux `~/.cache/heliopsf`. \
-Compiled kernels are kept in it, if numba finds no other folder for them (`NUMBA_CACHE_DIR`). |
+Compiled kernels are kept in it, if they cannot be kept beside the package or in `NUMBA_CACHE_DIR`. |
 | `HELIOPSF_CACHE_MIB` | Largest size of the cache, MiB; default: 2048; 0: PSFs are not kept. |
 """
 
