@@ -184,9 +184,13 @@ def directions(values: Sequence[float], covariance: Matrix) -> str:
     best, worst = np.sqrt(np.maximum(variances, 0.0))
     if worst <= _DETERMINED:
         return "the images determine the change along x and along y"
+    # An eigenvector has no sign: the directions are those of angles from 0 to 180 degrees.
     angle = math.degrees(math.atan2(ways[1, 0], ways[0, 0])) % 180
     across = (angle + 90) % 180
-    along, other = (float(way @ np.asarray(values)) for way in ways.T)
+    along, other = (
+        values[0] * math.cos(math.radians(way)) + values[1] * math.sin(math.radians(way))
+        for way in (angle, across)
+    )
     return (
         f"the images cannot tell x from y: they determine the change along {angle:.0f} degrees from x to y, "
         f"{100 * along:+.1f} ± {100 * best:.1f} % across the field, but along {across:.0f} degrees only "

@@ -123,4 +123,5 @@ def test_one_track_cannot_tell_x_from_y_and_says_so() -> None:
     covariance = 0.02**2 * np.outer(along, along) + 0.3**2 * np.outer(across, across)
     told = directions([0.16, 0.12], covariance)
     assert "cannot tell x from y" in told and "37 degrees" in told and "127 degrees" in told
+    assert "+20.0 ± 2.0 %" in told and "-20.0 ± 2.0 %" in directions([-0.16, -0.12], covariance)
     assert "cannot" not in directions([0.16, 0.12], 0.03**2 * np.eye(2))
