@@ -44,7 +44,7 @@ class PlacedPsf:
 
 
 @dataclass(frozen=True)
-class FieldFit:
+class PlacesFit:
     """A PSF that changes over the field, fitted to PSFs at places.
 
     Attributes
@@ -64,7 +64,7 @@ class FieldFit:
     clipped: float
 
 
-def fit_places(given: Sequence[PlacedPsf], detector: tuple[int, int], *, order: int = 1) -> FieldFit:
+def fit_places(given: Sequence[PlacedPsf], detector: tuple[int, int], *, order: int = 1) -> PlacesFit:
     """Fit Eq. (1) with all powers whose sum is at most `order`.
 
     The fit has the name, the cards and the plate scale of the first PSF.
@@ -109,7 +109,7 @@ def fit_places(given: Sequence[PlacedPsf], detector: tuple[int, int], *, order: 
             "fitted to": f"PSFs at {len(given)} places of the detector of {detector[0]} x {detector[1]} px"
         },
     )
-    return FieldFit(psf, misplaced, tuple(one for one in wanted if one not in powers), clipped)
+    return PlacesFit(psf, misplaced, tuple(one for one in wanted if one not in powers), clipped)
 
 
 def read_array_psf(path: str | Path) -> list[PlacedPsf]:

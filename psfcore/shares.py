@@ -28,3 +28,9 @@ def shared_out(work: Callable[[range], Result], count: int, threads: int) -> lis
     with ThreadPoolExecutor(len(others)) as pool:
         pending = [pool.submit(work, share) for share in others]
         return [work(first), *(one.result() for one in pending)]
+
+
+def in_order(work: Callable[[int], Result], count: int, threads: int) -> list[Result]:
+    """The results of `work` for the numbers from 0 to count - 1, in this order for any number of threads."""
+    shares = shared_out(lambda share: [work(n) for n in share], count, threads)
+    return [shares[n % len(shares)][n // len(shares)] for n in range(count)]

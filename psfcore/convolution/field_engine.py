@@ -100,7 +100,7 @@ class FieldEngine(Engine):
     def columns(self, *, adjoint: bool) -> None:
         """The columns of Eq. (1) or Eq. (2): transform them, multiply by the transfer functions, and transform back."""
         kernel = _columns_adjoint if adjoint else _columns_forward
-        terms = (self._transfers, self._source, self._along_y, self._opens)
+        terms = (self._transfers, self._source, self._along_y, *([self._opens] if adjoint else []))
         self._stage(kernel, self.column_plan, self.column_blocks, *terms)
         self._to_rows = len(self._factors) if adjoint else 0
 
@@ -142,7 +142,6 @@ def _columns_forward(
     transfers: Single,
     source: NDArray[np.int64],
     factors: Single,
-    opens: NDArray[np.bool_],
 ) -> None:
     """The columns of Eq. (1). The result is in the spectrum of the field.
 
@@ -154,8 +153,6 @@ def _columns_forward(
         The number of the spectrum of each term, 0 for that of the field.
     factors
         The factors v^b [term][row].
-    opens
-        Whether a term is the first one of its spectrum.
     """
     buffer, total, length = lines.buffer, lines.second, lines.plan.length
     rows = min(lines.spectrum.shape[1], length)
@@ -192,14 +189,10 @@ def _columns_adjoint(
 ) -> None:
     """The columns of Eq. (2), from the spectrum of the field. The results are in all spectra.
 
+    The other parameters are those of `_columns_forward`.
+
     Parameters
     ----------
-    transfers
-        Transfer functions, [term] and then as `Engine.transfer`.
-    source
-        The number of the spectrum of each term, 0 for that of the field.
-    factors
-        The factors v^b [term][row].
     opens
         Whether a term is the first one of its spectrum.
     """

@@ -138,11 +138,15 @@ def share_from_beyond(psf: Psf) -> NDArray[np.float64]:
     """Compute b of Eq. (1) for d = 0, 1, ... px, up to half the size of the PSF. If the PSF changes over the field, it
     is the largest b of nine places.
     """
+    return np.asarray(np.max([_share(*sums) for sums in _sums(psf)], axis=0))
+
+
+def _sums(psf: Psf) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """The sums of a PSF's rows and of its columns; at nine places, if it changes over the field."""
     kernels = common_shape([psf.kernel, *(term.kernel for term in psf.field_terms)])
     along_y, along_x = (np.array([one.sum(axis=axis) for one in kernels]) for axis in (1, 0))
     places = nine_places() if psf.field_terms else [(0.0, 0.0)]
-    shares = [_share(of @ along_y, of @ along_x) for of in factors_at(psf.field_terms, places)]
-    return np.asarray(np.max(shares, axis=0))
+    return [(of @ along_y, of @ along_x) for of in factors_at(psf.field_terms, places)]
 
 
 def _share(along_y: NDArray[np.float64], along_x: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -163,14 +167,14 @@ def light_across(image: Image, psf: Psf) -> float:
     """Compute w of Eq. (2): with periodic edges, no pixel gets more light than this from beyond the edges, if the
     brightness of the scene is that of the image.
     """
-    across, places = 0.0, list(nine_places()) if psf.field_terms else [(0.0, 0.0)]
-    for axis, n in enumerate(image.pixels.shape):
+    across = 0.0
+    for axis, (n, sums) in enumerate(zip(image.pixels.shape, zip(*_sums(psf), strict=True), strict=True)):
         others = 1 - axis
         brightest = np.maximum(
             image.pixels.max(axis=others, where=image.finite, initial=0.0),
             -image.pixels.min(axis=others, where=image.finite, initial=0.0),
         )
-        weights = np.max([psf.at(u, v).sum(axis=others) for u, v in places], axis=0)
+        weights = np.max(sums, axis=0)
         light, first = np.convolve(brightest, weights), weights.size // 2
         across += float(np.concatenate([light[:first], light[first + n :]]).max(initial=0.0))  # Eq. (2)
     return across

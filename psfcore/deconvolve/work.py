@@ -178,13 +178,16 @@ class Work:
         # Most deconvolutions compute no errors, and do not load SciPy.
         from psfcore.deconvolve.assess.error_planes import error_planes, spread_of_results
 
+        def pixels(image: Image | None = None, psf: Psf | None = None) -> Plane:
+            return self.run(image, psf).pixels.astype(np.float64, copy=False)
+
         progress = begin(ERROR_ESTIMATE, self.options.error_draws)
         # The first run deconvolves the model image without noise.
         told = None if progress is None else lambda done, of: progress(done - 1, of - 1)
         planes = error_planes(
             self.image,
             self.psf,
-            lambda image: self.run(image).pixels.astype(np.float64, copy=False),
+            pixels,
             replace(self.options, progress=told),
             estimate=result.pixels.astype(np.float64, copy=False),
             draws=self.options.error_draws,
@@ -195,7 +198,7 @@ class Work:
             return planes
         spread = spread_of_results(
             psfs,
-            lambda psf: self.run(psf=psf).pixels.astype(np.float64, copy=False),
+            lambda psf: pixels(psf=psf),
             progress=begin("errors of the PSF", len(psfs)),
         )
         return replace(planes, psf_error=np.where(np.isnan(planes.error), np.nan, spread))

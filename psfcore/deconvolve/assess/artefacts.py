@@ -41,7 +41,7 @@ from numpy.typing import NDArray
 
 from psfcore.deconvolve.assess import ranks
 from psfcore.deconvolve.assess.compared import Compared, Places, row_blocks, with_rim
-from psfcore.shares import shared_out
+from psfcore.shares import in_order
 
 HOLE_SHARE = 0.02
 DETECTION_SIGMA = 5.0
@@ -123,15 +123,12 @@ def find_artefacts(pair: Compared, peak_weight: float, *, sigma: NoiseAt | None 
 def _marked(pair: Compared, sign: Sign, suspected: Flags) -> int:
     """Add the pixels with a sign to the suspected ones; the number of pixels with this sign."""
 
-    def marked(share: range) -> int:
-        count = 0
-        for n in share:
-            found = sign(pair.blocks[n])
-            suspected[pair.blocks[n]] |= found
-            count += int(np.count_nonzero(found))
-        return count
+    def marked(n: int) -> int:
+        found = sign(pair.blocks[n])
+        suspected[pair.blocks[n]] |= found
+        return int(np.count_nonzero(found))
 
-    return sum(shared_out(marked, len(pair.blocks), pair.threads))
+    return sum(in_order(marked, len(pair.blocks), pair.threads))
 
 
 @dataclass(frozen=True, eq=False)
@@ -404,14 +401,7 @@ def _largest_around(pair: Compared) -> Flags:
 
 def _by_rows(pair: Compared, of: Sign) -> Flags:
     """The flags [y, x] that a function finds in blocks of rows."""
-    flags = np.empty_like(pair.counted)
-
-    def found(share: range) -> None:
-        for n in share:
-            flags[pair.blocks[n]] = of(pair.blocks[n])
-
-    shared_out(found, len(pair.blocks), pair.threads)
-    return flags
+    return np.concatenate(in_order(lambda n: of(pair.blocks[n]), len(pair.blocks), pair.threads))
 
 
 def _first_of_equals(pair: Compared, largest: Flags) -> Flags:

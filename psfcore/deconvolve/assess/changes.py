@@ -34,7 +34,7 @@ from psfcore.fits.units import dn_per_unit
 from psfcore.image import Image
 from psfcore.noise import Noise
 from psfcore.psf import Psf
-from psfcore.shares import shared_out
+from psfcore.shares import in_order
 
 BLOCKS_PX = (1, 4, 8, 16, 32)  # powers of 2
 TAILS_PCT = (5.0, 1.0, 0.1)
@@ -207,19 +207,14 @@ def bright_and_dark_change_pct(
     pair = Compared(single(image.pixels), single(result), image.valid, threads)
     low, high = ranks.percentiles(pair.portions(pair.before.__getitem__), [1, 99])
 
-    def share(numbers: range) -> NDArray[np.float64]:
-        light = np.zeros((2, 2))
-        for n in numbers:
-            old, new = (
-                pair.compared(plane[pair.blocks[n]], n).astype(np.float64)
-                for plane in (pair.before, pair.after)
-            )
-            for tail, flags in enumerate((old >= high, old <= low)):
-                light[tail] += old[flags].sum(), new[flags].sum()
-        return light
+    def light(n: int) -> NDArray[np.float64]:
+        old, new = (
+            pair.compared(plane[pair.blocks[n]], n).astype(np.float64) for plane in (pair.before, pair.after)
+        )
+        return np.array([[one[tail].sum() for one in (old, new)] for tail in (old >= high, old <= low)])
 
-    light = np.sum(shared_out(share, len(pair.blocks), threads), axis=0).tolist()
-    bright, dark = (100 * (after / before - 1) if before > 0 else None for before, after in light)
+    total = np.sum(in_order(light, len(pair.blocks), threads), axis=0).tolist()
+    bright, dark = (100 * (after / before - 1) if before > 0 else None for before, after in total)
     return bright, dark
 
 
@@ -289,21 +284,16 @@ class _Blocks:
             old = self.old.read(n)
             return old, (old <= low) | (old >= high)
 
-        def count(share: range) -> list[tuple[int, int]]:
-            return [(n, int(np.count_nonzero(tails(n)[1]))) for n in share]
-
         portions, threads = len(self.old.sizes), self.old.threads
-        counts = [pair for share in shared_out(count, portions, threads) for pair in share]
-        ends = np.cumsum([of_portion for _, of_portion in sorted(counts)])
+        ends = np.cumsum(in_order(lambda n: np.count_nonzero(tails(n)[1]), portions, threads))
         before, after = np.empty((2, ends[-1]), np.float32)
 
-        def fill(share: range) -> None:
-            for n in share:
-                old, chosen = tails(n)
-                here = slice(ends[n] - np.count_nonzero(chosen), ends[n])
-                before[here], after[here] = old[chosen], self.new.read(n)[chosen]
+        def fill(n: int) -> None:
+            old, chosen = tails(n)
+            here = slice(ends[n] - np.count_nonzero(chosen), ends[n])
+            before[here], after[here] = old[chosen], self.new.read(n)[chosen]
 
-        shared_out(fill, portions, threads)
+        in_order(fill, portions, threads)
         return before, after
 
 
@@ -318,11 +308,9 @@ def _larger_blocks(before: Plane, after: Plane, pair: Compared) -> list[_Blocks]
     """
     sizes = [size for size in BLOCKS_PX if size > 1]
 
-    def share(numbers: range) -> list[tuple[int, list[Means]]]:
-        return [(n, _means_of_rows(before, after, pair, pair.blocks[n])) for n in numbers]
-
-    parts = [part for one in shared_out(share, len(pair.blocks), pair.threads) for part in one]
-    of_rows = [means for _, means in sorted(parts, key=lambda part: part[0])]
+    of_rows = in_order(
+        lambda n: _means_of_rows(before, after, pair, pair.blocks[n]), len(pair.blocks), pair.threads
+    )
     found = []
     for k, block_px in enumerate(sizes):
         both = np.concatenate([means[k] for means in of_rows], axis=1)
@@ -446,11 +434,10 @@ def _contrast(means: ranks.Portions) -> float | None:
 
 def _total(means: ranks.Portions, of: Callable[[Plane], Plane]) -> float:
     """The sum of a function of all numbers, in double precision."""
-
-    def share(numbers: range) -> float:
-        return sum(float(of(means.read(n).astype(np.float64)).sum()) for n in numbers)
-
-    return sum(shared_out(share, len(means.sizes), means.threads))
+    totals = in_order(
+        lambda n: float(of(means.read(n).astype(np.float64)).sum()), len(means.sizes), means.threads
+    )
+    return sum(totals)
 
 
 def _percentiles(pair: Compared, of: Callable[[slice], Plane]) -> dict[str, float]:

@@ -83,8 +83,7 @@ class Compared:
 
 def single(plane: Plane) -> Single:
     """The plane in single precision; pixels that are not finite have the median of the finite ones."""
-    middle, single = _middle(plane), plane.astype(np.float32, copy=False)
-    return single if middle is None else np.where(np.isfinite(single), single, np.float32(middle))
+    return filled(plane.astype(np.float32, copy=False))
 
 
 def row_blocks(count: int) -> Iterator[slice]:
@@ -111,7 +110,7 @@ def with_rim(plane: NDArray[Number], rows: slice, rim_px: int) -> NDArray[Number
 def filled(plane: Plane) -> Plane:
     """Replace the pixels of a plane that are not finite by the median of the finite pixels."""
     middle = _middle(plane)
-    return plane if middle is None else np.where(np.isfinite(plane), plane, middle)
+    return plane if middle is None else np.where(np.isfinite(plane), plane, plane.dtype.type(middle))
 
 
 def _middle(plane: Plane) -> float | None:
