@@ -109,6 +109,10 @@ class FieldEngine(Engine):
         super().multiply_columns(transfer, conjugate=conjugate)
         self._to_rows = 0
 
+    def transform_columns(self) -> None:
+        """Raise TypeError: `multiply_kept` applies one filter, and would leave the terms out."""
+        raise TypeError("expected an engine for a PSF without terms of the field")
+
     def row_stage(
         self,
         kernel: Callable[..., None],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -51,6 +52,13 @@ def test_a_periodic_field_continues_with_its_opposite_side() -> None:
     nine = direct(np.tile(scene, (3, 3)), gaussian(21, 2.0))
     nine += direct(np.tile(scene * u, (3, 3)), term.kernel)
     assert np.abs(found - nine[48:96, 64:128]).max() < 1e-6
+
+
+def test_one_filter_is_refused_where_terms_would_be_left_out() -> None:
+    term = FieldTerm(lopsided(9, np.random.default_rng(3)), 1, 0)
+    u, v = Place.of_detector(32, 32).coordinates((32, 32))
+    with pytest.raises(TypeError, match="without terms"):
+        FieldEngine(gaussian(9, 2.0), [term], (u, v), (32, 32)).transform_columns()
 
 
 @settings(deadline=None, max_examples=40)
